@@ -8,6 +8,7 @@ from pathlib import Path
 import av
 import numpy as np
 
+from tests.servers.tools import rewrite_json
 from tests.servers.videos import write_depth, write_rgb
 
 CAMERAS = range(6)
@@ -55,20 +56,28 @@ def as_range(near_m: float, far_m: float, *, unit_m: float):
     return change
 
 
-def rewrite_rgb(folder: Path, camera: int, change, *, crf: int = 18) -> None:
-    """Replace a camera's pictures (t, h, w, 3) by change(pictures); 0 is without loss."""
-    path = folder / f"cam_{camera:02d}_rgb.mp4"
-    with av.open(str(path)) as container:
-        pictures = np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
-    write_rgb(path, np.ascontiguousarray(change(pictures)), options={"crf": f"{crf}"})
+def rewrite_rgb(folder: Path, change, *, cameras=CAMERAS, crf: int = 18) -> None:
+    """Replace cameras' pictures (t, h, w, 3) by change(pictures); 0 is without loss."""
+    for camera in cameras:
+        path = folder / f"cam_{camera:02d}_rgb.mp4"
+        with av.open(str(path)) as container:
+            pictures = np.stack([f.to_ndarray(format="rgb24") for f in container.decode(video=0)])
+        write_rgb(path, np.ascontiguousarray(change(pictures)), options={"crf": f"{crf}"})
 
 
-def edit_baseline(folder: Path, change) -> None:
-    """Let change(document) alter baseline.json."""
-    path = folder / "baseline.json"
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
+def depth_of(camera: int, change):
+    """Return what replaces the depth of a camera of a scene by change(units)."""
+    return lambda folder: rewrite_depth(folder, change, cameras=[camera])
+
+
+def pictures_of(camera: int, change, **how):
+    """Return what replaces the pictures of a camera of a scene by change(pictures)."""
+    return lambda folder: rewrite_rgb(folder, change, cameras=[camera], **how)
+
+
+def without_texture(folder: Path) -> None:
+    """Make all pictures grey."""
+    rewrite_rgb(folder, lambda pictures: np.full_like(pictures, 128))
 
 
 def scale_camera(folder: Path, **factors: float) -> None:
@@ -78,7 +87,7 @@ def scale_camera(folder: Path, **factors: float) -> None:
         for name, factor in factors.items():
             document["camera_intrinsics"][name] *= factor
 
-    edit_baseline(folder, change)
+    rewrite_json(folder / "baseline.json", change)
 
 
 def edit_pairs(folder: Path, change) -> None:
@@ -88,7 +97,7 @@ def edit_pairs(folder: Path, change) -> None:
         for pair in (*document["adjacent_pairs"], *document["pairwise_pairs"]):
             change(pair)
 
-    edit_baseline(folder, change_all)
+    rewrite_json(folder / "baseline.json", change_all)
 
 
 def lengthen_label(folder: Path, cameras: tuple[int, int], *, by_cm: float) -> None:
@@ -103,15 +112,16 @@ def lengthen_label(folder: Path, cameras: tuple[int, int], *, by_cm: float) -> N
 
 def place_cameras(folder: Path, factors: dict[int, float]) -> None:
     """Record cameras so many times as far from camera 0, in the poses and the baselines alike."""
-    path = folder / "trajectory.json"
-    document = json.loads(path.read_text())
-    for frame in document["frames"]:
-        first = {axis: frame["cameras"][0]["location"][axis] for axis in "xyz"}
-        for camera, factor in factors.items():
-            location = frame["cameras"][camera]["location"]
-            for axis in "xyz":
-                location[axis] = first[axis] + factor * (location[axis] - first[axis])
-    path.write_text(json.dumps(document))
+
+    def move(document):
+        for frame in document["frames"]:
+            first = {axis: frame["cameras"][0]["location"][axis] for axis in "xyz"}
+            for camera, factor in factors.items():
+                location = frame["cameras"][camera]["location"]
+                for axis in "xyz":
+                    location[axis] = first[axis] + factor * (location[axis] - first[axis])
+
+    document = rewrite_json(folder / "trajectory.json", move)
     places = [[*camera["location"].values()] for camera in document["frames"][0]["cameras"]]
 
     def change(pair):

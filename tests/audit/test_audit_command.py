@@ -6,7 +6,7 @@ import pytest
 
 from stereogenbench_data.audit.geometry import audit as geometry_audit
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
-from tests.audit.corruption import copied, rewrite_rgb
+from tests.audit.corruption import copied, pictures_of
 from tests.cli.command import invoke
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
@@ -32,7 +32,7 @@ def test_data_that_are_right_are_reported_as_a_table_with_exit_code_0(small_shar
 def test_a_finding_ends_with_exit_code_1_and_json_is_all_that_stdout_gets(
     small_release, run, tmp_path
 ):
-    rewrite_rgb(copied(small_release / SCENE, tmp_path / "data"), 0, lambda frames: frames // 30)
+    pictures_of(0, lambda seen: seen // 30)(copied(small_release / SCENE, tmp_path / "data"))
 
     result = run(tmp_path / "data", *FEW, "--json", "-o", tmp_path / "a.md")
 

@@ -36,15 +36,18 @@ from tests.audit.corruption import (
     as_range,
     as_ray,
     copied,
-    edit_baseline,
+    depth_of,
     exchange,
     late,
+    pictures_of,
     place_cameras,
     rewrite_depth,
     rewrite_rgb,
     scale_camera,
     scaled,
+    without_texture,
 )
+from tests.servers.tools import rewrite_json
 
 UNIT_M = 0.001
 FULL_FRAME = RayCasting(sensors_mm=((36, 24),))
@@ -332,7 +335,7 @@ def primary_pair_swapped(folder):
         pair = document["primary_stereo_pair"]
         pair["left_camera"], pair["right_camera"] = pair["right_camera"], pair["left_camera"]
 
-    edit_baseline(folder, swap)
+    rewrite_json(folder / "baseline.json", swap)
 
 
 def exchanged(cameras, **options):
@@ -416,14 +419,6 @@ def test_files_numbered_one_too_high_are_seen_and_nothing_is_pasted(verdict_on):
     assert "confirmed" not in {found.status for found in verdict.answers}
 
 
-def depth_of(camera, change):
-    return lambda folder: rewrite_depth(folder, change, cameras=[camera])
-
-
-def pictures_of(camera, change):
-    return lambda folder: rewrite_rgb(folder, camera, change)
-
-
 @pytest.mark.parametrize(
     ("corrupt", "words"),
     [
@@ -431,7 +426,7 @@ def pictures_of(camera, change):
         (depth_of(3, late(2)), r"depth of camera 3 fits better with a lag of \+2 frames"),
         (depth_of(0, lambda units: np.flip(units, 1)),
          r"depth of camera 0 fits better flipped \(vertical\)"),
-        (lambda folder: rewrite_depth(folder, as_inverse(folder), cameras=[4]),
+        (lambda folder: depth_of(4, as_inverse(folder))(folder),
          r"depth of camera 4 fits worse than that of file \d does in its place"),
         (pictures_of(0, lambda pictures: np.roll(pictures, -1, axis=1)),
          r"pictures of camera 0 are [01]\.\d px higher, or show another moment"),
@@ -473,8 +468,8 @@ def of_another_scene(*names):
 
 def other_rig(folder, other):
     """Take the other scene's poses, and record the baselines that they have."""
-    own, others = (json.loads((each / "trajectory.json").read_text()) for each in (folder, other))
-    (folder / "trajectory.json").write_text(json.dumps(own | {"frames": others["frames"]}))
+    frames = json.loads((other / "trajectory.json").read_text())["frames"]
+    rewrite_json(folder / "trajectory.json", lambda own: own.update(frames=frames))
     place_cameras(folder, {})
 
 
@@ -581,7 +576,7 @@ def test_two_cameras_that_differ_are_both_named(verdict_on):
 def test_pictures_of_most_cameras_in_other_rows_are_told_as_that(verdict_on):
     def corrupt(folder):
         for camera, rows in {1: 1, 3: -1, 4: 2, 5: -2}.items():
-            rewrite_rgb(folder, camera, lambda pictures, by=rows: np.roll(pictures, by, axis=1))
+            pictures_of(camera, lambda pictures, by=rows: np.roll(pictures, by, axis=1))(folder)
 
     verdict = verdict_on(corrupt)
 
@@ -590,11 +585,6 @@ def test_pictures_of_most_cameras_in_other_rows_are_told_as_that(verdict_on):
         for problem in verdict.problems
     )
     assert verdict.problems
-
-
-def without_texture(folder):
-    for camera in range(6):
-        rewrite_rgb(folder, camera, lambda pictures: np.full_like(pictures, 120))
 
 
 def six_equal_views(folder):
@@ -680,8 +670,7 @@ def test_a_scene_in_which_nothing_moves_does_not_tell_the_lag(verdict_on):
 
     def corrupt(folder):
         rewrite_depth(folder, still)
-        for camera in range(6):
-            rewrite_rgb(folder, camera, still)
+        rewrite_rgb(folder, still)
 
     verdict = verdict_on(corrupt)
 

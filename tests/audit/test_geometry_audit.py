@@ -1,6 +1,5 @@
 """The audit of whole scenes: exact ones, the same ones in shards, and ones made wrong."""
 
-import json
 import re
 import shutil
 import warnings
@@ -19,16 +18,20 @@ from stereogenbench_data.synthesis.request import SynthRequest
 from tests.audit.corruption import (
     as_ray,
     copied,
+    depth_of,
     exchange,
     late,
     lengthen_label,
+    pictures_of,
     place_cameras,
     read_depth,
     rewrite_depth,
     rewrite_rgb,
     scale_camera,
     scaled,
+    without_texture,
 )
+from tests.servers.tools import rewrite_json
 
 SCENE = "train/Uniform/SynthStage/scene_000000"
 
@@ -131,19 +134,11 @@ def test_the_table_has_the_papers_figures_beside(exact):
     assert both.paper == "1.20e-06 px / 4.39e-03 px"
 
 
-def pictures(camera, change, **options):
-    return lambda folder: rewrite_rgb(folder, camera, change, **options)
-
-
-def depth(camera, change):
-    return lambda folder: rewrite_depth(folder, change, cameras=[camera])
-
-
 def one_view_twice(folder):
     shutil.copy(folder / "cam_02_rgb.mp4", folder / "cam_03_rgb.mp4")
 
 
-flat = pictures(4, lambda seen: np.full_like(seen, 128))
+flat = pictures_of(4, lambda seen: np.full_like(seen, 128))
 
 
 def without_depth(units):
@@ -166,11 +161,11 @@ def tags(camera, told):
 
 
 def edit_trajectory(folder, change):
-    path = folder / "trajectory.json"
-    document = json.loads(path.read_text())
-    for frame in document["frames"]:
-        change(frame, document["frames"][0])
-    path.write_text(json.dumps(document))
+    def change_all(document):
+        for frame in document["frames"]:
+            change(frame, document["frames"][0])
+
+    rewrite_json(folder / "trajectory.json", change_all)
 
 
 def turn(frame, _):
@@ -180,31 +175,31 @@ def turn(frame, _):
 @pytest.mark.parametrize(
     ("change", "where", "check", "found"),
     [
-        (pictures(2, lambda seen: (seen * 0.05).astype(np.uint8)), "cam_02_rgb.mp4", "too dark",
+        (pictures_of(2, lambda seen: (seen * 0.05).astype(np.uint8)), "cam_02_rgb.mp4", "too dark",
          "mean luma, of 255 is "),
         (flat, "cam_04_rgb.mp4", "flat", "of 255 is 0, frame 0 "),
-        (pictures(1, lambda seen: seen[[0, 1, 2, 3, 3, 3, 3]], crf=0), "cam_01_rgb.mp4", "frozen",
-         "is 0, frame 3 (limit 0.25)"),
+        (pictures_of(1, lambda seen: seen[[0, 1, 2, 3, 3, 3, 3]], crf=0), "cam_01_rgb.mp4",
+         "frozen", "is 0, frame 3 (limit 0.25)"),
         (one_view_twice, "cam_03_rgb.mp4", "copied view", "is 100 %, as in cam_02_rgb.mp4"),
-        (depth(0, without_depth), "cam_00_depth.mkv", "invalid depth",
+        (depth_of(0, without_depth), "cam_00_depth.mkv", "invalid depth",
          "share of pixels with depth is 0 %, frame 3 "),
-        (depth(0, lambda units: units * 0 + 900), "cam_00_depth.mkv", "invalid depth",
+        (depth_of(0, lambda units: units * 0 + 900), "cam_00_depth.mkv", "invalid depth",
          "count of different depths is 1 "),
-        (depth(1, lambda units: units[[0] * 7]), "cam_01_depth.mkv", "frozen",
+        (depth_of(1, lambda units: units[[0] * 7]), "cam_01_depth.mkv", "frozen",
          "depth that changes to the next audited frame while the camera moves is 0 %, frame 0"),
-        (depth(5, hidden), "cam_05_depth.mkv", "occluder", "covers is 40."),
-        (pictures(1, late(1)), "cam_01_rgb.mp4", "picture time", "by those of the frame after"),
-        (pictures(4, lambda seen: seen[::-1]), "cam_04_rgb.mp4", "picture content",
+        (depth_of(5, hidden), "cam_05_depth.mkv", "occluder", "covers is 40."),
+        (pictures_of(1, late(1)), "cam_01_rgb.mp4", "picture time", "by those of the frame after"),
+        (pictures_of(4, lambda seen: seen[::-1]), "cam_04_rgb.mp4", "picture content",
          "correlation with other cameras' pictures"),
-        (depth(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth residual",
+        (depth_of(0, lambda units: np.roll(units, 1, 2)), "cam_00_depth.mkv", "depth residual",
          "most in 0-5 (limit 0.05 %); `stereogenbench doctor` looks for the cause: depth, "),
-        (depth(2, noisy), "cam_02_depth.mkv", "depth agreement", "2 %, but not to 0.5 % is 7"),
+        (depth_of(2, noisy), "cam_02_depth.mkv", "depth agreement", "2 %, but not to 0.5 % is 7"),
         (lambda folder: rewrite_depth(folder, noisy), "", "depth agreement", "(limit 20 %); noise"),
-        (depth(4, scaled(1.02)), "cam_04_depth.mkv", "depth residual", "is 2.011 %, most"),
+        (depth_of(4, scaled(1.02)), "cam_04_depth.mkv", "depth residual", "is 2.011 %, most"),
         (lambda folder: rewrite_depth(folder, as_ray(folder)), "", "depth residual", ", most in "),
         (lambda folder: scale_camera(folder, sensor_height_mm=3 / 4), "", "motion residual",
          "; `stereogenbench doctor` looks for the cause"),
-        (depth(3, scaled(2.0)), "cam_03_depth.mkv", "depth consistency", ", most in "),
+        (depth_of(3, scaled(2.0)), "cam_03_depth.mkv", "depth consistency", ", most in "),
         (lambda folder: rewrite_depth(folder, lambda u: np.where(u < 65535, u // 20 * 20, u)),
          "cam_00_depth.mkv", "depth quantum", "distance of stored numbers is 20 units"),
         (lambda folder: exchange(folder, {1: 4, 4: 1}), "", "depth consistency", ", most in "),
@@ -282,18 +277,12 @@ def test_units_that_contradict_one_another_are_one_finding(indexed_release, tmp_
     assert "differ by a scale: 0.001, 0.001, 0.01, 0.001, 0.001, 0.001 m" in finding.found
 
 
-def without_texture(folder):
-    for camera in range(6):
-        rewrite_rgb(folder, camera, lambda seen: seen * 0 + 128)
-
-
 def standing_still(folder):
     def stand(frame, first):
         frame["cameras"] = first["cameras"]
 
     rewrite_depth(folder, lambda units: units[[0] * 7])
-    for camera in range(6):
-        rewrite_rgb(folder, camera, lambda seen: seen[[0] * 7])
+    rewrite_rgb(folder, lambda seen: seen[[0] * 7])
     edit_trajectory(folder, stand)
 
 

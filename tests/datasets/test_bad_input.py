@@ -1,6 +1,5 @@
 """Damaged data, as a user of StereoPairs meets them: each is named with its file and the cure."""
 
-import json
 import os
 import re
 import shutil
@@ -21,6 +20,7 @@ from stereogenbench_data.samples.fields import OddSceneWarning
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.datasets.conftest import write_again
+from tests.servers.tools import rewrite_json
 from tests.servers.videos import write_rgb
 
 NEEDING_ALL_VIDEOS = [(0, 1), (2, 3), (4, 5)]
@@ -38,13 +38,6 @@ def scene(small_release, tmp_path):
 
 def root_of(scene):
     return scene.parents[3]
-
-
-def rewrite(path, change):
-    """Change a JSON file's document in place."""
-    document = json.loads(path.read_text())
-    change(document)
-    path.write_text(json.dumps(document))
 
 
 DAMAGES = {
@@ -87,7 +80,7 @@ def test_a_damaged_scene_is_refused_when_the_tree_is_opened(scene, what):
     elif isinstance(damage, str):
         (scene / name).write_text(damage)
     else:
-        rewrite(scene / name, damage)
+        rewrite_json(scene / name, damage)
 
     with pytest.raises(StereoGenBenchError, match=f"(?s){re.escape(name)}.*{found}"):
         StereoPairs(root_of(scene), fields=FIELDS, pairs=NEEDING_ALL_VIDEOS)
@@ -201,7 +194,7 @@ def turn(scene, camera, **angles_deg):
             for name, angle_deg in angles_deg.items():
                 frame["cameras"][camera]["rotation"][name] += angle_deg
 
-    rewrite(scene / "trajectory.json", change)
+    rewrite_json(scene / "trajectory.json", change)
 
 
 def test_a_rig_that_is_not_rectified_is_warned_of_and_goes_through_its_poses(scene):
@@ -235,7 +228,7 @@ def test_impossible_poses_are_not_used_and_no_field_gives_them(scene, cameras, y
 
 def test_a_principal_point_outside_the_picture_holds_up_the_intrinsics_alone(scene):
     centred = StereoPairs(root_of(scene), fields=("disparity",))[0]["disparity"]
-    rewrite(
+    rewrite_json(
         scene / "baseline.json",
         lambda doc: doc["camera_intrinsics"].update(principal_point_px={"x": 32, "y": -4}),
     )

@@ -1,6 +1,5 @@
 """Shards, and servers that serve them on this machine."""
 
-import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,7 +12,7 @@ from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
 from tests.servers.nginx import nginx_serving
-from tests.servers.tools import made_once, require_module, require_tool
+from tests.servers.tools import made_once, require_module, require_tool, rewrite_json
 from tests.servers.videos import write_depth, write_rgb
 
 BUCKET = "some-bucket"
@@ -35,9 +34,8 @@ def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory)
 
     def make(root: Path) -> None:
         folder = Path(shutil.copytree(small_release / key, root / key))
-        rig = folder / "baseline.json"
-        document = json.loads(rig.read_text())
-        rig.write_text(json.dumps(document | {"image_width": NOISE_PX, "image_height": NOISE_PX}))
+        sides = {"image_width": NOISE_PX, "image_height": NOISE_PX}
+        rewrite_json(folder / "baseline.json", lambda document: document.update(sides))
         noise = np.random.default_rng(0)
         size = (NOISE_PX, NOISE_PX)
         for path in folder.glob("*.mp4"):

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from tests.servers.tools import rewrite_json
 from tests.servers.videos import FRAMES, SIZE, write_video
 
 PLACES_CM = (0.0, 10.0, 25.0, 31.0, 60.0, 72.5)
@@ -93,15 +94,9 @@ def make_scene(tmp_path: Path, video: Callable[..., Path]) -> Callable[..., Path
 
 
 @pytest.fixture
-def rewrite() -> Callable[[Path, Callable[[Any], object]], None]:
+def rewrite() -> Callable[[Path, Callable[[Any], object]], Any]:
     """Change a JSON file in place."""
-
-    def change(path: Path, edit: Callable[[Any], object]) -> None:
-        document = json.loads(path.read_text())
-        edit(document)
-        path.write_text(json.dumps(document))
-
-    return change
+    return rewrite_json
 
 
 @pytest.fixture

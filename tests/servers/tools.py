@@ -1,6 +1,7 @@
 """What tests need of the system, and folders that all processes of a run share."""
 
 import importlib
+import json
 import os
 import shutil
 import signal
@@ -35,6 +36,14 @@ def files_of(root: Path) -> dict[str, bytes]:
         for path in sorted(root.rglob("*"))
         if path.is_file() and path.suffix != ".lock"
     }
+
+
+def rewrite_json(path: Path, change: Callable[[Any], object]) -> Any:
+    """Let a function change the document of a JSON file in place; return the document."""
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    return document
 
 
 def require_tool(name: str) -> str:
