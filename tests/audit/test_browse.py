@@ -2,7 +2,6 @@
 
 import dataclasses
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from stereogenbench_data import SceneIndex, StereoPairs
 from tests.audit.browsing import run, serving
 from tests.audit.corruption import rewrite_depth
-from tests.servers.tools import chromium, require_module
+from tests.servers.tools import chromium, require_module, wait_until
 
 # The index names a scene that was left out, each time that it is opened.
 pytestmark = pytest.mark.filterwarnings(
@@ -23,7 +22,6 @@ FLAGS = (
 )  # fmt: skip
 COPIES = 40
 """Each of the four scenes is listed so often, so that the list has to be scrolled."""
-WAIT_S = 60
 
 
 def unmeasured_corner(units):
@@ -79,7 +77,7 @@ class Page:
     def open(self, place=""):
         self.browser.get("about:blank")
         self.browser.get(f"{self.address}#{place}")
-        self.until(lambda: self.script("return document.body.dataset.ready") == "yes")
+        wait_until(lambda: self.script("return document.body.dataset.ready") == "yes")
         self.settle()
 
     def script(self, code, *values):
@@ -88,15 +86,9 @@ class Page:
     def text(self, name):
         return self.script("return document.getElementById(arguments[0]).textContent", name)
 
-    def until(self, condition):
-        deadline = time.monotonic() + WAIT_S
-        while not condition():
-            assert time.monotonic() < deadline, "the page did not get there"
-            time.sleep(0.05)
-
     def settle(self):
         """Wait until the line of the sample is that of the pair and the frame that are shown."""
-        self.until(lambda: self.frame() in self.text("sample-line") and self.text("readout"))
+        wait_until(lambda: self.frame() in self.text("sample-line") and self.text("readout"))
 
     def frame(self):
         return f"frames={self.text('frame-number').partition(' /')[0]})"
@@ -111,7 +103,7 @@ class Page:
             "document.querySelector(`#facet-${arguments[0]} [value='${arguments[1]}']`).click()",
             name, value,
         )  # fmt: skip
-        self.until(lambda: self.text("selection-line") != before)
+        wait_until(lambda: self.text("selection-line") != before)
 
     def type(self, name, value):
         """Write into a field of the filters."""
@@ -211,30 +203,30 @@ def test_the_keyboard_alone_flips_frames_pairs_scenes_and_views(page):
     arrows = require_module("selenium.webdriver.common.keys").Keys
 
     page.press(arrows.ARROW_RIGHT, arrows.ARROW_RIGHT)
-    page.until(lambda: page.text("frame-number") == "2 / 6")
+    wait_until(lambda: page.text("frame-number") == "2 / 6")
     page.press(arrows.END)
-    page.until(lambda: page.text("frame-number") == "6 / 6")
+    wait_until(lambda: page.text("frame-number") == "6 / 6")
     page.press(arrows.ARROW_RIGHT, arrows.HOME, arrows.ARROW_RIGHT)
-    page.until(lambda: page.text("frame-number") == "1 / 6")
+    wait_until(lambda: page.text("frame-number") == "1 / 6")
     first = page.script("return document.querySelector('.pair[aria-checked=true] b').textContent")
     page.press(arrows.ARROW_DOWN)
     shown = "return document.querySelector('.pair[aria-checked=true] b').textContent"
-    page.until(lambda: page.script(shown) != first)
+    wait_until(lambda: page.script(shown) != first)
     before = page.text("key")
     page.press("j")
-    page.until(lambda: page.text("key") != before)
+    wait_until(lambda: page.text("key") != before)
     page.press("k")
-    page.until(lambda: page.text("key") == before)
+    wait_until(lambda: page.text("key") == before)
     page.press("4")
     panes = "return [...document.querySelectorAll('[data-pane]')].map((box) => box.dataset.pane)"
-    page.until(lambda: page.script(panes) == ["disparity"])
+    wait_until(lambda: page.script(panes) == ["disparity"])
     page.press("d")
-    page.until(lambda: page.text("at") == "x 33, y 32")
+    wait_until(lambda: page.text("at") == "x 33, y 32")
     page.press("8")
-    page.until(lambda: page.script(panes) == ["wiggle"])
+    wait_until(lambda: page.script(panes) == ["wiggle"])
     caption = "return document.querySelector('.pane figcaption').textContent"
-    page.until(lambda: "right" in page.script(caption))
-    page.until(lambda: "left" in page.script(caption))
+    wait_until(lambda: "right" in page.script(caption))
+    wait_until(lambda: "left" in page.script(caption))
     page.press("/")
     assert page.script("return document.activeElement.id") == "caption"
 
@@ -243,7 +235,7 @@ def test_the_list_holds_few_rows_and_scrolls_to_any(page):
     assert len(keys_listed(page)) < 60
 
     page.script("document.getElementById('list').scrollTop = 1e6")
-    page.until(lambda: "train/Uniform/SynthStage/scene_000159" in keys_listed(page))
+    wait_until(lambda: "train/Uniform/SynthStage/scene_000159" in keys_listed(page))
     assert len(keys_listed(page)) < 60
 
 
@@ -266,7 +258,7 @@ def test_a_broken_scene_is_named_and_what_can_be_read_is_shown(page):
 
 def reset(page):
     page.script("document.getElementById('reset-all').click()")
-    page.until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
+    wait_until(lambda: page.text("count") == "160 scenes, 2,400 pairs")
 
 
 def visible(page, *places):
@@ -285,18 +277,18 @@ def visible(page, *places):
 def test_where_nothing_is_left_nothing_stale_is_shown_and_a_button_resets(page):
     before = page.text("key")
     page.type("caption", "zebra at night")
-    page.until(lambda: page.text("count") == "0 scenes, 0 pairs")
+    wait_until(lambda: page.text("count") == "0 scenes, 0 pairs")
 
     assert visible(page, "#nothing", "#reset-all", "#stage", ".heading", "#pairs", ".code") == [
         True, True, False, False, False, False,
     ]  # fmt: skip
     assert "none with all of zebra, at, night" in page.text("nothing-reason")
     assert keys_listed(page) == []
-    page.until(lambda: "caption=zebra+at+night" in page.hash())
+    wait_until(lambda: "caption=zebra+at+night" in page.hash())
     assert "key=" not in page.hash()
 
     reset(page)
-    page.until(lambda: visible(page, "#stage", "#nothing") == [True, False])
+    wait_until(lambda: visible(page, "#stage", "#nothing") == [True, False])
     assert page.text("key") == before
     assert page.script("return document.getElementById('caption').value") == ""
 
@@ -309,22 +301,22 @@ def test_the_address_is_a_link_to_filters_sample_and_view(page):
     pairs = run(page.text("selection-line"))["pairs"]
     assert (len(pairs.plan.scene_rows), len(pairs.plan.pairs)) == (80, 1200)
     page.type("baseline-low", "10")
-    page.until(lambda: "baseline_cm=(10, " in page.text("selection-line"))
-    page.until(lambda: page.text("key") in page.text("sample-line"))
+    wait_until(lambda: "baseline_cm=(10, " in page.text("selection-line"))
+    wait_until(lambda: page.text("key") in page.text("sample-line"))
     first = page.text("key")
     page.press("j", "4")
-    page.until(lambda: page.text("key") != first)
-    page.until(lambda: page.text("key") in page.text("sample-line"))
-    page.until(lambda: f"key={page.text('key')}&pair=" in page.hash())
-    page.until(lambda: "view=disparity" in page.hash())
+    wait_until(lambda: page.text("key") != first)
+    wait_until(lambda: page.text("key") in page.text("sample-line"))
+    wait_until(lambda: f"key={page.text('key')}&pair=" in page.hash())
+    wait_until(lambda: "view=disparity" in page.hash())
     link = page.hash()
     names = ("key", "count", "selection-line", "sample-line", "frame-number")
     told = {name: page.text(name) for name in names}
 
     def paste(link):
         page.script("location.hash = arguments[0]", link)
-        page.until(lambda: page.text("count") == told["count"])
-        page.until(lambda: page.text("sample-line") == told["sample-line"])
+        wait_until(lambda: page.text("count") == told["count"])
+        wait_until(lambda: page.text("sample-line") == told["sample-line"])
 
     for follow in (page.open, paste):
         page.open()
@@ -349,12 +341,12 @@ def test_a_link_to_a_scene_that_is_not_there_says_so(page):
     assert visible(page, "#notice", "#stage") == [True, True]
     shown = page.text("key")
     page.script("location.hash = 'key=train/Nowhere/scene_000001'")
-    page.until(lambda: "train/Nowhere" in page.text("notice"))
+    wait_until(lambda: "train/Nowhere" in page.text("notice"))
     page.settle()
     assert page.text("key") == shown
 
     page.press("j")
-    page.until(lambda: not visible(page, "#notice")[0])
+    wait_until(lambda: not visible(page, "#notice")[0])
 
 
 @pytest.fixture

@@ -79,9 +79,8 @@ class Fail:
 
 
 @pytest.mark.parametrize("workers", [1, 2, 4])
-def test_of_several_damaged_files_the_first_samples_error_comes(small_index, workers):
+def test_of_several_damaged_files_the_first_samples_error_comes(small_index, keyed, workers):
     options = {"fields": TRUE_FIELDS, "pairs": "adjacent", "frames": "all"}
-    keyed = StereoPairs(small_index, fields=("__key__",), pairs="adjacent", frames="all")
     late = [
         [key for key in keys if int(key.rpartition("/")[2]) >= 4]
         for keys in keys_of(keyed.loader(9))

@@ -87,10 +87,9 @@ def scene(encoding, *, rig="rectified", seed=0, size=SIZE):
     return views, known
 
 
-def written(views, known, *, kind, fields):
+def written(views, known, *, kind, fields, layout):
     """Return a clip with these fields, as a dataset writes it."""
     address = Address(0, views.source, views.targets, FRAMES)
-    layout = "stacked" if kind == "views" else "single"
     request = Request(kind=kind, fields=fields, layout=layout)
     writer = SampleWriter(request, address, clip="clip", allocate=new_array)
     writer.write(views, known, slice(0, len(FRAMES)))
@@ -98,7 +97,8 @@ def written(views, known, *, kind, fields):
 
 
 def batch_of(scenes):
-    return collate([written(*each, kind="views", fields=DERIVE_FIELDS) for each in scenes])
+    how = {"kind": "views", "fields": DERIVE_FIELDS, "layout": "stacked"}
+    return collate([written(*each, **how) for each in scenes])
 
 
 def expected_of(scenes, pairs=CAMERA_PAIRS):
@@ -108,7 +108,7 @@ def expected_of(scenes, pairs=CAMERA_PAIRS):
         made = [
             written(
                 replace(views, source=source, targets=(target,)), known,
-                kind="pairs", fields=DERIVED_FIELDS,
+                kind="pairs", fields=DERIVED_FIELDS, layout="single",
             )
             for source, target in pairs
         ]  # fmt: skip
@@ -164,18 +164,16 @@ def test_points_behind_the_second_camera_are_not_valid_and_nothing_is_nan():
 
 def test_a_sweep_is_valid_where_every_second_camera_has_the_point_ahead():
     views, known = scene(CONTRACTS["planar depth"], rig="turned apart")
+    how = {"kind": "pairs", "fields": ("valid", "disparity")}
+
+    sweep = written(views, known, **how, layout="stacked")
+
     one = [
-        written(replace(views, targets=(target,)), known, kind="pairs", fields=("valid",))["valid"]
+        written(replace(views, targets=(target,)), known, **how, layout="single")["valid"]
         for target in views.targets
     ]
-
-    request = Request(kind="pairs", fields=("valid", "disparity"), layout="stacked")
-    address = Address(0, views.source, views.targets, FRAMES)
-    writer = SampleWriter(request, address, clip="clip", allocate=new_array)
-    writer.write(views, known, slice(0, len(FRAMES)))
-
-    assert np.array_equal(writer.sample["valid"], np.logical_and.reduce([v.numpy() for v in one]))
-    assert not np.array_equal(one[0], one[-1])
+    assert torch.equal(sweep["valid"], torch.stack(one).all(dim=0))
+    assert not torch.equal(one[0], one[-1])
 
 
 @pytest.mark.parametrize("cx_px", [20.0, 20.3])

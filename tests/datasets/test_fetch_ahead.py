@@ -1,12 +1,9 @@
 """Data behind a URL: few requests, fetched ahead, and nothing left of a broken pass."""
 
-import contextlib
 import gc
 import shutil
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +20,7 @@ from stereogenbench_data.sources.retry import RetryPolicy
 from stereogenbench_data.sources.web import pool_of
 from tests.datasets.conftest import fork_and, same
 from tests.servers.failing_server import Answer, serving
+from tests.servers.tools import open_files, wait_until
 from tests.sources.policies import LONGEST_S, ended
 
 FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
@@ -41,15 +39,10 @@ def alone():
     gc.collect()
     before = sockets()
     yield
-    deadline = time.monotonic() + 60
-    while fetching() and time.monotonic() < deadline:
-        time.sleep(0.01)
-    assert fetching() == []
+    wait_until(lambda: fetching() == [])
     pool_of.cache_clear()
-    while len(sockets()) > len(before) and time.monotonic() < deadline:
-        gc.collect()
-        time.sleep(0.01)  # the server's ends are closed by its own threads
-    assert len(sockets()) <= len(before)
+    # The server's ends are closed by its own threads.
+    wait_until(lambda: gc.collect() >= 0 and len(sockets()) <= len(before))
 
 
 def fetching():
@@ -57,14 +50,7 @@ def fetching():
 
 
 def sockets():
-    folder = Path("/proc/self/fd")
-    if not folder.is_dir():
-        pytest.skip("needs /proc")
-    links = []
-    for each in folder.iterdir():
-        with contextlib.suppress(OSError):
-            links.append(str(each.readlink()))
-    return [link for link in links if link.startswith("socket:")]
+    return [path for path in open_files() if path.startswith("socket:")]
 
 
 def parts_asked(server):
@@ -239,8 +225,7 @@ def test_closing_does_not_wait_for_requests_that_hang_and_they_end(served):
     served.always = {path: Answer(delay_s=2 * LONGEST_S) for path in shards}
     with ThreadPoolExecutor(1) as threads:
         waiting = threads.submit(next, iter(pairs.loader(1)))
-        while not fetching():
-            time.sleep(0.01)
+        wait_until(fetching)
         ended(pairs.close)
         assert isinstance(waiting.exception(), StorageError)
 

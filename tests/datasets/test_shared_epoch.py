@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from functools import partial
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 
@@ -173,32 +174,23 @@ def test_a_loader_made_in_each_epoch_is_warned_of_once_where_it_would_repeat(sma
 def test_a_forked_rank_has_an_epoch_of_its_own_which_its_workers_share(small_index):
     """Else a slow rank would draw for the epoch that a fast one has gone on to."""
     pairs = StereoPairs(small_index, fields=("__key__",), frames=("random", 3))
-    pairs.set_epoch(1)
-    expected = {}
-    for epoch in (1, 4):
-        pairs.set_epoch(epoch)
-        expected[epoch] = sorted(sample["__key__"] for sample in pairs)
+    first, fourth = (pairs.set_epoch(epoch) or sorted(keys_of(pairs)) for epoch in (1, 4))
     pairs.set_epoch(1)
 
     def rank():
         assert pairs.epoch == 1
         pairs.set_epoch(4)
         loader = DataLoader(pairs, batch_size=4, num_workers=1, collate_fn=collate)
-        found = sorted(key for batch in loader for key in batch["__key__"])
-        assert found == expected[4] != expected[1]
+        assert sorted(flat(keys_of(loader))) == fourth != first
 
     assert fork_and(rank) == 0
     assert pairs.epoch == 1
 
 
-@pytest.mark.parametrize("mode", ["inference", "default device"])
+@pytest.mark.parametrize("mode", [torch.inference_mode, partial(torch.device, "meta")], ids=str)
 def test_a_dataset_is_made_in_any_mode_of_torch(small_index, mode):
-    if mode == "inference":
-        with torch.inference_mode():
-            pairs = StereoPairs(small_index, fields=("__key__",))
-    else:
-        with torch.device("meta"):
-            pairs = StereoPairs(small_index, fields=("__key__",))
+    with mode():
+        pairs = StereoPairs(small_index, fields=("__key__",))
     pairs.set_epoch(2)
 
     assert pairs.epoch == 2

@@ -1,9 +1,7 @@
 """The pool of open videos."""
 
 import gc
-from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Streams
 from stereogenbench_data.schema.records import DepthEncoding
 from stereogenbench_data.sources.members import MemberSource
+from tests.servers.tools import open_files
 
 RGB = [f"cam_{camera:02d}_rgb.mp4" for camera in range(6)]
 DEPTH = "cam_00_depth.mkv"
@@ -29,14 +28,10 @@ def pool_of(data, **how):
     return Streams(MemberSource(data.root, shards=data.shards), **how)
 
 
-def open_files():
-    """Return the videos that this process has open, as Linux tells."""
+def open_videos():
+    """Return the videos that this process has open."""
     gc.collect()
-    links = []
-    for link in Path("/proc/self/fd").iterdir():
-        with suppress(OSError):
-            links.append(str(link.readlink()))
-    return sorted(link for link in links if link.endswith((".mp4", ".mkv", ".tar")))
+    return [path for path in open_files() if path.endswith((".mp4", ".mkv", ".tar"))]
 
 
 def test_the_pool_keeps_no_more_videos_open_than_its_limit(data):
@@ -45,9 +40,9 @@ def test_the_pool_keeps_no_more_videos_open_than_its_limit(data):
         for name in RGB:
             pool.rgb(data.scene(row), name, 0, size=None)
 
-    assert len(open_files()) == 4
+    assert len(open_videos()) == 4
     pool.close()
-    assert open_files() == []
+    assert open_videos() == []
 
 
 def test_a_picture_is_handed_out_read_only_and_not_decoded_twice(data):
@@ -104,4 +99,4 @@ def test_a_video_that_failed_is_closed(data):
     with pytest.raises(MediaError, match=r"cam_00_rgb.mp4: has no frame 9"):
         pool.rgb(scene, RGB[0], 9, size=None)
 
-    assert open_files() == []
+    assert open_videos() == []

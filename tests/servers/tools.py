@@ -6,8 +6,9 @@ import os
 import shutil
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -75,6 +76,25 @@ def chromium(*flags: str) -> Iterator[Any]:
     service = services.Service(executable_path=require_tool("chromedriver"))
     with webdriver.Chrome(options=options, service=service) as driver:
         yield driver
+
+
+def open_files() -> list[str]:
+    """Return what this process has open, as Linux tells; elsewhere skip."""
+    folder, links = Path("/proc/self/fd"), []
+    if not folder.is_dir():
+        pytest.skip("needs /proc")
+    for each in folder.iterdir():
+        with suppress(OSError):
+            links.append(str(each.readlink()))
+    return links
+
+
+def wait_until(condition: Callable[[], object]) -> None:
+    """Wait until a condition holds; fail where that takes a minute."""
+    deadline_s = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline_s, "it did not come about within a minute"
+        time.sleep(0.01)
 
 
 def killed_fork(act: Callable[[], object]) -> bool:

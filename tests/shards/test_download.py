@@ -3,7 +3,6 @@
 import os
 import shutil
 import subprocess
-import time
 
 import pytest
 
@@ -14,6 +13,7 @@ from stereogenbench_data.schema.release import depth_name, rgb_name
 from stereogenbench_data.shards.download import download, wanted_files
 from tests.cli.command import COMMAND, refused, succeed
 from tests.servers.failing_server import Answer
+from tests.servers.tools import wait_until
 from tests.shards.shard_files import bytes_of
 
 
@@ -166,9 +166,7 @@ def test_a_killed_download_leaves_whole_files_and_goes_on(
         web.always[str(name)] = Answer(delay_s=0.1)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     killed = subprocess.Popen([*COMMAND, *command], **quiet)
-    deadline = time.monotonic() + 60
-    while not list(dest.rglob("cam_00_rgb.mp4")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    wait_until(lambda: list(dest.rglob("cam_00_rgb.mp4")))
     killed.kill()
     killed.wait()
     there = [path for path in dest.rglob("*.*") if not path.name.startswith(".") and path.is_file()]

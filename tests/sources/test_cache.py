@@ -4,7 +4,6 @@ import errno
 import multiprocessing
 import os
 import subprocess
-import time
 import zlib
 
 import pytest
@@ -17,7 +16,7 @@ from stereogenbench_data.sources import cache as cache_module
 from stereogenbench_data.sources.cache import FOLDER_NAME, ShardCache
 from stereogenbench_data.sources.remote import RemoteObject
 from tests.servers.failing_server import Answer
-from tests.servers.tools import small_disk
+from tests.servers.tools import small_disk, wait_until
 
 FORK = multiprocessing.get_context("fork")
 DATA = bytes(number * 7 % 256 for number in range(100_000))
@@ -290,9 +289,7 @@ def test_processes_that_need_more_than_fits_all_read_what_they_ask_for(fillers, 
 def test_a_process_that_is_killed_while_it_fills_leaves_no_lock_and_no_half(fillers, web):
     web.answers = [Answer(stop_after=2000), Answer(delay_s=5.0)]
     (killed,) = fillers([4])
-    deadline = time.monotonic() + 60
-    while len(web.answers) > 0 and time.monotonic() < deadline:
-        time.sleep(0.01)
+    wait_until(lambda: not web.answers)
     killed.kill()
     killed.join()
 
