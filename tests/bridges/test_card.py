@@ -17,6 +17,7 @@ from stereogenbench_data.errors import DescriptorError
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
 from tests.servers.tools import require_module
+from tests.shards.shard_files import scenes_of
 
 SAMPLE = Path(__file__).resolve().parents[2] / "shards"
 LOAD = """
@@ -93,8 +94,7 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
     assert done.returncode == 0, done.stderr[-3000:]
     found = json.loads(done.stdout)
     assert len(found["None train"]) == 4, "without a config: all families"
-    index = SceneIndex.open(SAMPLE)
-    scenes = {index.scene(row).id.key: index.scene(row) for row in range(len(index))}
+    scenes = scenes_of(SAMPLE)
     assert [row[0] for row in found["Uniform train"]] == [
         f"train/Uniform/SynthStage/scene_{number:06d}" for number in range(2)
     ]
@@ -118,8 +118,8 @@ def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):
         write_card(index, tmp_path, repository="a/b")
 
 
-def test_the_card_states_the_features_of_packed_depth(packed_depth_shards):
-    text = card(SceneIndex.open(packed_depth_shards), repository="a/b")
+def test_the_card_states_the_features_of_packed_depth(packed_depth):
+    text = card(SceneIndex.open(packed_depth), repository="a/b")
 
     head = yaml.safe_load(text.split("---")[1])
     names = [each["name"] for each in head["dataset_info"][0]["features"]]

@@ -20,6 +20,7 @@ from stereogenbench_data.shards.pack import pack
 from tests.bridges.validation import problems_of
 from tests.cli.command import succeed
 from tests.servers.tools import require_tool
+from tests.shards.shard_files import scenes_of
 
 HOME = Path(__file__).resolve().parents[2]
 SHIPPED = HOME / "croissant"
@@ -37,14 +38,13 @@ def loaded(cache, *paths):
     return json.loads(done.stdout)
 
 
-def stored(index, *names):
+def stored(index, form, *, cameras=range(6)):
     """Return [scene, camera or None, crc32] of members, as the index has them."""
-    found = []
-    for row in range(len(index)):
-        scene = index.scene(row)
-        for camera, name in names:
-            found.append([scene.id.key, camera, scene.members[name].crc32])
-    return sorted(found)
+    return sorted(
+        [key, camera, scene.members[form.format(camera)].crc32]
+        for key, scene in scenes_of(index.root).items()
+        for camera in cameras
+    )
 
 
 @pytest.fixture(scope="module")
@@ -90,10 +90,10 @@ def of_many(index, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(packed_depth_shards, of_many, tmp_path_factory):
+def found(packed_depth, of_many, tmp_path_factory):
     """The records of four descriptors by their names, which one process loads."""
     root = tmp_path_factory.mktemp("c")
-    write_descriptor(SceneIndex.open(packed_depth_shards), root / "packed.json")
+    write_descriptor(SceneIndex.open(packed_depth), root / "packed.json")
     paths = [SHIPPED / "release.json", SHIPPED / "sample.json", root / "packed.json", of_many]
     assert problems_of(root / "packed.json") == []
     return {path.stem: each for path, each in zip(paths, loaded(root, *paths), strict=True)}
@@ -125,12 +125,10 @@ def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(
         "scene_complete_json": 8,
     }  # fmt: skip
     assert records["backwards"] == records["counts"]
-    cameras = range(6)
-    rgb = stored(sample, *((camera, f"cam_{camera:02d}_rgb.mp4") for camera in cameras))
-    assert records["contents"]["rgb_videos"] == rgb
-    depth = stored(sample, *((camera, f"cam_{camera:02d}_depth.mkv") for camera in cameras))
-    assert records["contents"]["depth_videos"] == depth
-    assert records["contents"]["baseline_json"] == stored(sample, (None, "baseline.json"))
+    contents = records["contents"]
+    assert contents["rgb_videos"] == stored(sample, "cam_{:02d}_rgb.mp4")
+    assert contents["depth_videos"] == stored(sample, "cam_{:02d}_depth.mkv")
+    assert contents["baseline_json"] == stored(sample, "baseline.json", cameras=[None])
     assert records["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
 
 
@@ -183,9 +181,9 @@ def test_absolute_addresses_pass_the_steps_of_the_conference_checker(web, index,
     assert records["first_of_each"] == [True] * len(records["counts"])
 
 
-def test_shards_of_packed_depth_are_described_by_its_suffix(packed_depth_shards, found):
-    packed, cameras = SceneIndex.open(packed_depth_shards), range(6)
-    depth = stored(packed, *((camera, f"cam_{camera:02d}_depth.b2frame") for camera in cameras))
+def test_shards_of_packed_depth_are_described_by_its_suffix(packed_depth, found):
+    packed = SceneIndex.open(packed_depth)
+    depth = stored(packed, "cam_{:02d}_depth.b2frame")
     assert found["packed"]["contents"]["depth_videos"] == depth
     assert found["packed"]["counts"]["media_files"] == 12 * len(packed)
 

@@ -24,6 +24,7 @@ from stereogenbench_data.bridges.matching import (
     UniMatch,
 )
 from stereogenbench_data.index.table import SceneIndex
+from tests.datasets.conftest import same
 
 ADAPTERS = [
     pytest.param(RaftStereo, {}, id="RAFT-Stereo"),
@@ -178,13 +179,7 @@ def test_torchs_own_loader_and_ours_give_the_same_items(indexed_release, adapter
     sent = pickle.loads(pickle.dumps(dataset))  # as other processes get it
     torchs = next(iter(DataLoader(sent, batch_size=2, num_workers=1)))
 
-    assert flat(ours).keys() == flat(torchs).keys()
-    for name, value in flat(ours).items():
-        assert (
-            torch.equal(value, flat(torchs)[name])
-            if torch.is_tensor(value)
-            else (value == flat(torchs)[name])
-        )
+    assert same(flat(ours), flat(torchs))
 
 
 def flat(batch):

@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 from stereogenbench_data import StereoPairs
 from stereogenbench_data.bridges.webdataset import decode
 from stereogenbench_data.errors import SchemaError, SelectionError, StorageError
+from tests.bridges.conftest import require_equal
 
 FIELDS = ("left", "right", "disparity", "valid", "baseline_m", "pair", "scene", "__key__")
 
@@ -42,9 +43,7 @@ def scenes(urls):
     ],
     ids=["released", "with parsed JSON", "derived for training"],
 )
-def test_the_stage_gives_the_samples_of_the_map_style_dataset(
-    request, equal_samples, shards, parsed, options
-):
+def test_the_stage_gives_the_samples_of_the_map_style_dataset(request, shards, parsed, options):
     folder = request.getfixturevalue(shards)
     expected = StereoPairs(folder, fields=FIELDS, **options)
     scenes = webdataset.WebDataset(sorted(map(str, folder.glob("*.tar"))), shardshuffle=False)
@@ -55,7 +54,7 @@ def test_the_stage_gives_the_samples_of_the_map_style_dataset(
 
     assert len(found) == len(expected) > 0
     for sample in expected:
-        assert equal_samples(found[sample["__key__"]], sample)
+        require_equal(found[sample["__key__"]], sample)
 
 
 def test_the_url_is_that_of_the_shard(scenes, urls):

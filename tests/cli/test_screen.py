@@ -88,8 +88,8 @@ def test_the_doctor_says_first_what_is_wrong(small_release):
     assert lines[-1] == "-o FILE writes the whole report."
 
 
-def test_damaged_shards_are_told_by_kinds_of_damage(small_shards, tmp_path):
-    shards, file = shutil.copytree(small_shards, tmp_path / "shards"), tmp_path / "problems.txt"
+def test_damaged_shards_are_told_by_kinds_of_damage(shards, tmp_path):
+    file = tmp_path / "problems.txt"
     for tar in shards.glob("*.tar"):
         content = bytearray(tar.read_bytes())
         content[2000::5000] = bytes(255 - each for each in content[2000::5000])

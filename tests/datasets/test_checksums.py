@@ -19,12 +19,6 @@ SHARD = "train-IPD_Gaussian-000000.tar"
 WRONG = rf"{SHARD} ?: {rgb_name(0)}: has crc32 [0-9a-f]{{8}}, and the index says [0-9a-f]{{8}}. It"
 
 
-@pytest.fixture
-def shards(small_shards, tmp_path):
-    """A copy of the shards that may be damaged."""
-    return shutil.copytree(small_shards, tmp_path / "shards")
-
-
 def selected(root, **options):
     return StereoPairs(root, scenes=SCENE, fields=("left", "right"), **options)
 

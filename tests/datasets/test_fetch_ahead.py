@@ -21,6 +21,7 @@ from stereogenbench_data.sources.web import pool_of
 from tests.datasets.conftest import fork_and, same
 from tests.servers.failing_server import Answer, serving
 from tests.servers.tools import open_files, wait_until
+from tests.shards.shard_files import scenes_of
 from tests.sources.policies import LONGEST_S, ended
 
 FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
@@ -36,13 +37,11 @@ def served(large_shards):
 @pytest.fixture
 def alone():
     """Require that the test leaves no thread that fetches, and no socket, in this process."""
-    gc.collect()
-    before = sockets()
+    before = len(sockets())
     yield
     wait_until(lambda: fetching() == [])
     pool_of.cache_clear()
-    # The server's ends are closed by its own threads.
-    wait_until(lambda: gc.collect() >= 0 and len(sockets()) <= len(before))
+    wait_until(lambda: len(sockets()) <= before)  # the server's threads close their own ends
 
 
 def fetching():
@@ -50,6 +49,7 @@ def fetching():
 
 
 def sockets():
+    gc.collect()
     return [path for path in open_files() if path.startswith("socket:")]
 
 
@@ -128,14 +128,12 @@ def test_a_fork_in_the_middle_of_a_pass_reads_for_itself(served, large_shards, a
     pairs.close()
 
 
-def test_an_error_comes_at_the_sample_that_needs_the_bytes(small_shards, tmp_path, alone):
-    folder = shutil.copytree(small_shards, tmp_path / "shards")
-    index = SceneIndex.open(folder)
-    scenes = [index.scene(row) for row in range(len(index))]
+def test_an_error_comes_at_the_sample_that_needs_the_bytes(small_shards, alone):
+    scenes = [*scenes_of(small_shards).values()]
     first, shard = scenes[0], scenes[-1].members[rgb_name(0)].path
     last = next(scene for scene in scenes if scene.members[rgb_name(0)].path == shard)
     assert shard != first.members[rgb_name(0)].path
-    with serving(folder) as server:
+    with serving(small_shards) as server:
         server.always = {shard: Answer(status=403)}
         pairs = StereoPairs(server.url, fields=("left", "__key__"))
         loader = pairs.loader(1, shuffle=False, drop_last=False)

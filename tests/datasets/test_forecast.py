@@ -14,6 +14,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.load import Work
 from tests.cli.command import succeed
 from tests.servers.failing_server import Answer, serving
+from tests.shards.shard_files import scenes_of
 
 FIELDS = ("left", "right", "disparity", "frame_index", "__key__")
 
@@ -158,9 +159,9 @@ def test_the_bytes_of_local_data_are_those_of_the_same_data_afar(small_shards):
 
 
 def test_data_without_seek_tables_are_refused_with_the_cure(small_shards, tmp_path):
-    index = SceneIndex.open(small_shards)
-    scenes = [index.scene(row) for row in range(len(index))]
-    plain = SceneIndex.from_scenes(scenes, index.root, shards=index.shards)
+    shards = SceneIndex.open(small_shards).shards
+    scenes = scenes_of(small_shards).values()
+    plain = SceneIndex.from_scenes(scenes, small_shards, shards=shards)
 
     with pytest.raises(StorageError, match=r"where the packets.*`stereogenbench index`"):
         forecast(plain, samples_s=1)

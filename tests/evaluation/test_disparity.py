@@ -27,10 +27,11 @@ from stereogenbench_data.errors import PredictionError
 from stereogenbench_data.evaluation.disparity_maps import read_disparity
 from stereogenbench_data.evaluation.metrics.disparity import MEASURES, RANGES_PX, frame_scores
 from stereogenbench_data.evaluation.report import document, page
-from tests.cli.command import invoke as run
+from tests.cli.command import succeed
 from tests.evaluation.conftest import FRAMES
 
 FIELDS = ("left", "right", "disparity", "valid", "visible", "scene", "frame_index", "__key__")
+WHOLE = {"split": "eval", "frames": "all", "workers": 1}
 
 
 def expected(found, truth, scored):
@@ -161,10 +162,9 @@ def test_written_in_any_kind_of_file_and_returned_by_a_call_the_scores_are_the_s
         "big": lambda path, found: write_pfm(path, found, ">"),
     }
     folders = {name: write_maps(tmp_path / name, samples, kind) for name, kind in kinds.items()}
-    options = {"split": "eval", "frames": "all", "workers": 1}
-    called = evaluate_disparity(scored_index, method, **options)
+    called = evaluate_disparity(scored_index, method, **WHOLE)
     for folder in folders.values():
-        written = evaluate_disparity(scored_index, folder, **options)
+        written = evaluate_disparity(scored_index, folder, **WHOLE)
         assert repr([each.tallies for each in written.pairs]) == repr(
             [each.tallies for each in called.pairs]
         )
@@ -247,15 +247,14 @@ def test_truth_that_a_png_cannot_hold_refuses_the_pair(
         Image.fromarray(stored).save(path.with_suffix(".png"))
 
     folder = write_maps(tmp_path / "maps", samples, as_png)
-    options = {"split": "eval", "frames": "all", "workers": 1}
-    whole = evaluate_disparity(scored_index, folder, **options)
+    whole = evaluate_disparity(scored_index, folder, **WHOLE)
     assert not any(pair.problem for pair in whole.pairs)
 
     monkeypatch.setattr("stereogenbench_data.evaluation.disparity_maps.PNG_ENDS_PX", 2.0)
     with pytest.raises(PredictionError, match=r"ends at 2\.000 px.*PFM or npy"):
-        evaluate_disparity(scored_index, folder, **options)
+        evaluate_disparity(scored_index, folder, **WHOLE)
     within = DisparityProtocol(max_disparity_px=2.0)
-    found = evaluate_disparity(scored_index, folder, protocol=within, **options)
+    found = evaluate_disparity(scored_index, folder, protocol=within, **WHOLE)
     assert any(pair.tallies["beyond"].mean > 0 for pair in found.pairs)
 
 
@@ -286,14 +285,12 @@ def test_a_callable_that_returns_something_else_is_told_what_is_expected(
 
 
 def test_missing_maps_are_counted_where_they_are_allowed(scored_index, samples, tmp_path):
-    folder = write_maps(tmp_path / "maps", samples, lambda path, found: np.save(path, found))
+    folder = write_maps(tmp_path / "maps", samples, np.save)
     first = samples[0]["scene"]
     (folder / first / "00-01" / "002.npy").unlink()
-    options = {"split": "eval", "frames": "all", "workers": 1}
-
     with pytest.raises(PredictionError, match=r"no 002 of \.png, \.pfm, \.npy, \.npz"):
-        evaluate_disparity(scored_index, folder, **options)
-    found = evaluate_disparity(scored_index, folder, allow_missing=1, **options)
+        evaluate_disparity(scored_index, folder, **WHOLE)
+    found = evaluate_disparity(scored_index, folder, allow_missing=1, **WHOLE)
     assert [bool(pair.problem) for pair in found.pairs] == [
         pair.scene == first for pair in found.pairs
     ]
@@ -309,20 +306,20 @@ def test_a_stopped_run_goes_on_and_another_method_is_refused(scored_index, tmp_p
             raise KeyboardInterrupt
         return torch.ones(batch["left"][:, :1].shape)
 
-    options = {"split": "eval", "frames": "all", "out": tmp_path}
+    kept = {"split": "eval", "frames": "all", "out": tmp_path}
     with pytest.raises(EvaluationError, match="Pass name="):
-        evaluate_disparity(scored_index, method, **options)
+        evaluate_disparity(scored_index, method, **kept)
     with pytest.raises(KeyboardInterrupt):
-        evaluate_disparity(scored_index, method, name="ones", **options)
-    whole = evaluate_disparity(scored_index, method, name="ones", **options)
+        evaluate_disparity(scored_index, method, name="ones", **kept)
+    whole = evaluate_disparity(scored_index, method, name="ones", **kept)
 
     assert len(whole.pairs) == 3
     assert calls == [FRAMES] * 4  # the third scene alone came again
     with pytest.raises(EvaluationError, match="of other methods"):
-        evaluate_disparity(scored_index, method, name="others", **options)
+        evaluate_disparity(scored_index, method, name="others", **kept)
     limited = DisparityProtocol(max_disparity_px=5)
     with pytest.raises(EvaluationError, match="scored"):
-        evaluate_disparity(scored_index, method, name="ones", protocol=limited, **options)
+        evaluate_disparity(scored_index, method, name="ones", protocol=limited, **kept)
 
 
 def test_scored_at_another_size_disparity_is_in_its_pixels(scored_index):
@@ -343,8 +340,8 @@ def test_scored_at_another_size_disparity_is_in_its_pixels(scored_index):
 
 
 def test_a_validation_loop_gets_the_number_of_the_report(scored_index, samples, tmp_path):
-    folder = write_maps(tmp_path / "maps", samples, lambda path, found: np.save(path, found))
-    report = evaluate_disparity(scored_index, folder, split="eval", frames="all", workers=1)
+    folder = write_maps(tmp_path / "maps", samples, np.save)
+    report = evaluate_disparity(scored_index, folder, **WHOLE)
     table = {table.name: table for table in disparity_tables([report])}["regions"]
     error = DisparityError()
     for sample in samples:
@@ -391,8 +388,8 @@ def test_ranks_with_unequal_shares_compute_one_and_the_same_mean(tmp_path):
 
 
 def test_a_report_says_what_each_number_is_over(scored_index, samples, tmp_path):
-    folder = write_maps(tmp_path / "maps", samples, lambda path, found: np.save(path, found))
-    told = run("eval", "disparity", scored_index.where, folder, "-o", tmp_path / "out").stdout
+    folder = write_maps(tmp_path / "maps", samples, np.save)
+    told = succeed("eval", "disparity", scored_index.where, folder, "-o", tmp_path / "out").stdout
 
     assert "EPE px, answered" in told
     assert "D1, scored" in told

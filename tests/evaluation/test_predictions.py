@@ -1,6 +1,5 @@
 """Right views on disk: where they belong, and what each that is not right is told."""
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from stereogenbench_data.evaluation.predictions import (
     open_views,
     scaled_rgb,
 )
+from tests.servers.videos import write_rgb
 
 SCENE = "eval/MapSeenInTrain/Uniform/Town/scene_000001"
 WANTED = PairFrames(SCENE, (0, 1), (0, 2), 3, (8, 16), (32, 32))
@@ -32,14 +32,8 @@ def write_png(folder, frame, pixels):
 
 def write_video(path, levels, *, size=(8, 16)):
     path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(path, "w") as container:
-        stream = container.add_stream("ffv1", rate=15)
-        stream.width, stream.height, stream.pix_fmt = size[1], size[0], "bgr0"
-        for level in levels:
-            frame = av.VideoFrame.from_ndarray(picture(level, size=size), format="rgb24")
-            container.mux(stream.encode(frame.reformat(format="bgr0")))
-        container.mux(stream.encode(None))
-    return path
+    pictures = [picture(level, size=size) for level in levels]
+    return write_rgb(path, pictures, codec="ffv1", pixel_format="bgr0")
 
 
 def read(path, frame=0):

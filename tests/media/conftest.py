@@ -2,7 +2,7 @@
 
 import io
 import subprocess
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from pathlib import Path
 
 import av
@@ -10,6 +10,8 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from scipy import ndimage
+
+from stereogenbench_data.media.video import VideoReader, read_rgb
 
 FRAMES, HEIGHT, WIDTH = 48, 64, 96
 BLOCK = 8  # a painted bit is a square of so many pixels
@@ -131,6 +133,11 @@ class Clips:
         """Return the number painted into a frame, (3, h, w)."""
         blocks = rgb[1, :BLOCK, : 8 * BLOCK].reshape(BLOCK, 8, BLOCK).mean(axis=(0, 2))
         return sum(1 << bit for bit, level in enumerate(blocks) if level > 127)
+
+    def shown(self, file: object, order: Iterable[int], *, frames: int = FRAMES) -> list[int]:
+        """Return the numbers painted into frames of a clip, as a reader gives them."""
+        with VideoReader(file, name="clip", frames=frames) as reader:
+            return [self.number(read_rgb(reader, index)) for index in order]
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from stereogenbench_data.errors import MediaError
 from stereogenbench_data.media.seek_table import read_seek_table
-from stereogenbench_data.media.video import VideoReader, read_rgb
+from stereogenbench_data.media.video import VideoReader, probe, read_rgb
 from stereogenbench_data.sources.ranged_file import RangedFile
 
 X264 = ("-c:v", "libx264", "-pix_fmt", "yuv420p")
@@ -45,10 +45,7 @@ def test_every_frame_in_random_order_is_ffmpegs_own(clips, structure):
 def test_any_walk_over_the_frames_shows_the_painted_numbers(clips, structure, order):
     path = clips.encode(f"{structure}.mp4", *STRUCTURES[structure])
 
-    with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in order]
-
-    assert shown == order
+    assert clips.shown(path, order) == order
 
 
 WRITTEN = {
@@ -67,10 +64,7 @@ def test_a_late_start_and_other_ways_of_writing_do_not_shift_the_numbers(clips, 
     path = clips.folder / f"written {name}"
     clips.ffmpeg("-i", source, "-c", "copy", *WRITTEN[name], path)
 
-    with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in (40, 0, 1, 47)]
-
-    assert shown == [40, 0, 1, 47]
+    assert clips.shown(path, (40, 0, 1, 47)) == [40, 0, 1, 47]
 
 
 RATES = {
@@ -85,11 +79,8 @@ def test_frames_are_counted_by_order_at_rates_that_vary_or_no_clock_ticks(clips,
     how, rate = RATES[name]
     path = clips.encode(name, *how, *X264, "-g", "12", rate=rate)
 
-    with VideoReader(path, name="clip", frames=clips.frames) as reader:
-        shown = [clips.number(read_rgb(reader, index)) for index in (33, 5, 47, 0, 46)]
-
-    assert shown == [33, 5, 47, 0, 46]
-    assert how or reader.facts.frame_rate_hz == pytest.approx(24000 / 1001)
+    assert clips.shown(path, (33, 5, 47, 0, 46)) == [33, 5, 47, 0, 46]
+    assert how or probe(path, name="clip").frame_rate_hz == pytest.approx(24000 / 1001)
 
 
 @pytest.mark.parametrize("place", ["here", "far away"])
@@ -102,8 +93,7 @@ def test_frames_around_a_gap_are_counted_by_order_in_any_order(clips, place):
         table = read_seek_table(path, name="clip")
         file = RangedFile(lambda a, b: content[a:b], size=len(content), table=table)
 
-    with VideoReader(file, name="clip", frames=clips.frames - 1) as reader:
-        found = [clips.number(read_rgb(reader, index)) for index in (40, 5, 30, 11, 10, 46)]
+    found = clips.shown(file, (40, 5, 30, 11, 10, 46), frames=clips.frames - 1)
 
     assert found == [41, 5, 31, 12, 10, 47]
 

@@ -26,7 +26,11 @@ from tests.servers.videos import write_depth, write_rgb
 FRAMES = 30
 
 
-def write(path, *, codec, faststart=False):
+KINDS = {"rgb.mp4": "libx264", "fast.mp4": "libx264", "jpeg.mp4": "mjpeg", "depth.mkv": "ffv1"}
+"""One of each kind that the release and training shards have, and its encoder."""
+
+
+def write(path, codec):
     """A video of noise, whose packets are large enough to be skipped by seeking."""
     rng = np.random.default_rng(7)
     if codec == "ffv1":
@@ -34,25 +38,15 @@ def write(path, *, codec, faststart=False):
         return write_depth(path, units, options={"g": "10"})
     pictures = rng.integers(0, 256, (FRAMES, 64, 96, 3), dtype=np.uint8)
     pixel_format = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+    of_file = {"movflags": "faststart"} if path.name == "fast.mp4" else {}
     how = {"codec": codec, "pixel_format": pixel_format, "options": {"g": "10"}}
-    return write_rgb(
-        path, pictures, **how, file_options={"movflags": "faststart"} if faststart else {}
-    )
+    return write_rgb(path, pictures, **how, file_options=of_file)
 
 
 @pytest.fixture(scope="module")
 def videos(tmp_path_factory):
-    """One of each kind that the release and training shards have."""
     folder = tmp_path_factory.mktemp("seek")
-    return {
-        "rgb.mp4": write(folder / "rgb.mp4", codec="libx264"),
-        "fast.mp4": write(folder / "fast.mp4", codec="libx264", faststart=True),
-        "jpeg.mp4": write(folder / "jpeg.mp4", codec="mjpeg"),
-        "depth.mkv": write(folder / "depth.mkv", codec="ffv1"),
-    }
-
-
-KINDS = ("rgb.mp4", "fast.mp4", "jpeg.mp4", "depth.mkv")
+    return {name: write(folder / name, codec) for name, codec in KINDS.items()}
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -28,6 +28,23 @@ def small_shards(small_release: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 
 @pytest.fixture(scope="session")
+def packed_depth(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The scenes of `small_release` in shards whose depth blosc2 packed."""
+    require_module("blosc2")
+    return made_once(
+        tmp_path_factory,
+        "packed_depth",
+        lambda out: pack(small_release, out, workers=1, depth_codec="blosc2"),
+    )
+
+
+@pytest.fixture
+def shards(small_shards: Path, tmp_path: Path) -> Path:
+    """A copy of `small_shards` that a test may damage."""
+    return Path(shutil.copytree(small_shards, tmp_path / "shards"))
+
+
+@pytest.fixture(scope="session")
 def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One scene whose videos are noise: far larger than what is fetched at once."""
     key = "train/Uniform/SynthStage/scene_000000"

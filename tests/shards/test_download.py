@@ -205,9 +205,7 @@ def test_what_was_removed_since_an_earlier_download_is_not_listed(shards_on_the_
     assert set(keys) == {first.scene(1).id.key, fetched_key}
 
 
-def test_a_folder_with_an_index_of_other_data_is_refused(shards_on_the_web, small_shards, tmp_path):
-    shards = shutil.copytree(small_shards, tmp_path / "shards")
-
+def test_a_folder_with_an_index_of_other_data_is_refused(shards_on_the_web, small_shards, shards):
     with pytest.raises(StorageError, match="shards: has the index of other data"):
         fetched(shards_on_the_web, shards)
     assert bytes_of(shards) == bytes_of(small_shards)

@@ -26,29 +26,20 @@ FIELDS = tuple(name for name in PAIR_FIELDS if name != "__url__")
 
 
 @pytest.fixture(scope="module")
-def packed(small_release, tmp_path_factory):
-    """The small release with depth by blosc2; not to be changed."""
-    require_module("blosc2")
-    out = tmp_path_factory.mktemp("packed_depth") / "shards"
-    pack(small_release, out, depth_codec="blosc2", workers=1)
-    return out
-
-
-@pytest.fixture(scope="module")
-def unpacked(packed, tmp_path_factory):
+def unpacked(packed_depth, tmp_path_factory):
     """The tree that unpacking makes of them, with the report; not to be changed."""
     tree = tmp_path_factory.mktemp("unpacked") / "tree"
-    return tree, unpack(packed, tree)
+    return tree, unpack(packed_depth, tree)
 
 
 @pytest.fixture
-def shards(packed, tmp_path):
+def shards(packed_depth, tmp_path):
     """A copy that a test may change."""
-    return shutil.copytree(packed, tmp_path / "shards")
+    return shutil.copytree(packed_depth, tmp_path / "shards")
 
 
-def test_the_index_differs_in_depths_names_places_and_codec_alone(packed, small_shards):
-    found, released = scenes_of(packed), scenes_of(small_shards)
+def test_the_index_differs_in_depths_names_places_and_codec_alone(packed_depth, small_shards):
+    found, released = scenes_of(packed_depth), scenes_of(small_shards)
 
     assert found.keys() == released.keys()
     for key, scene in found.items():
@@ -63,17 +54,17 @@ def test_the_index_differs_in_depths_names_places_and_codec_alone(packed, small_
 
 
 @pytest.mark.parametrize("size", [None, (48, 56)])
-def test_pairs_are_the_same(packed, small_shards, size):
+def test_pairs_are_the_same(packed_depth, small_shards, size):
     options = {"fields": FIELDS, "pairs": "all", "frames": [0, 5], "size": size}
-    one, other = StereoPairs(packed, **options), StereoPairs(small_shards, **options)
+    one, other = StereoPairs(packed_depth, **options), StereoPairs(small_shards, **options)
 
     assert len(one) == len(other) == 4 * 15 * 2
     for number in range(0, len(one), 13):
         assert same(one[number], other[number])
 
 
-def test_sound_shards_verify_and_every_frame_is_decoded(packed):
-    report = verify(packed, mode="decode", workers=1)
+def test_sound_shards_verify_and_every_frame_is_decoded(packed_depth):
+    report = verify(packed_depth, mode="decode", workers=1)
 
     assert report.problems == ()
     assert report.videos_decoded == 48
@@ -90,14 +81,14 @@ def test_a_video_that_cannot_be_packed_whole_is_named(small_release, tmp_path):
     assert KEY not in SceneIndex.open(tmp_path / "out").column("key").tolist()
 
 
-def test_without_blosc2_the_extra_is_named(packed, small_release, tmp_path, monkeypatch):
+def test_without_blosc2_the_extra_is_named(packed_depth, small_release, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "blosc2", None)
     match = r"pip install 'stereogenbench-data\[blosc2\]'"
 
     with pytest.raises(ExtraError, match=match):
         pack(small_release, tmp_path / "out", depth_codec="blosc2")
     with pytest.raises(ExtraError, match=match):
-        StereoPairs(packed)[0]
+        StereoPairs(packed_depth)[0]
 
     assert not (tmp_path / "out").exists()
 
@@ -154,25 +145,29 @@ def test_unpacking_goes_on_where_it_was(small_shards, small_release, tmp_path):
         ("cam_03_depth.mkv", lambda path: (path.unlink(), path.mkdir())),
     ],
 )
-def test_a_file_that_is_there_and_differs_is_left_alone(packed, unpacked, tmp_path, name, change):
+def test_a_file_that_is_there_and_differs_is_left_alone(
+    packed_depth, unpacked, tmp_path, name, change
+):
     tree = shutil.copytree(unpacked[0], tmp_path / "tree")
     change(tree / KEY / name)
     (tree / KEY / "trajectory.json").unlink()
     before = bytes_of(tree)
 
     with pytest.raises(ShardError, match=rf"scene_000001/{name}: already exists, .*Move it away"):
-        unpack(packed, tree)
+        unpack(packed_depth, tree)
 
     assert bytes_of(tree) == before
 
 
 @pytest.mark.parametrize("other", ["cam_04_depth.mkv", "baseline.json"])
-def test_other_depth_in_the_place_of_restored_depth_is_refused(packed, unpacked, tmp_path, other):
+def test_other_depth_in_the_place_of_restored_depth_is_refused(
+    packed_depth, unpacked, tmp_path, other
+):
     tree = shutil.copytree(unpacked[0], tmp_path / "tree")
     shutil.copyfile(tree / KEY / other, tree / KEY / "cam_03_depth.mkv")
 
     with pytest.raises(ShardError, match=r"scene_000001/cam_03_depth.mkv: already exists, .*"):
-        unpack(packed, tree)
+        unpack(packed_depth, tree)
 
 
 @pytest.mark.parametrize("name", ["cam_03_depth.b2frame", "trajectory.json"])
@@ -189,22 +184,22 @@ def test_a_damaged_member_is_not_unpacked(shards, tmp_path, name):
     assert not list((tmp_path / "tree").rglob("*.unfinished"))
 
 
-def test_where_there_are_no_shards_nothing_is_unpacked(packed, small_release, tmp_path):
+def test_where_there_are_no_shards_nothing_is_unpacked(packed_depth, small_release, tmp_path):
     with pytest.raises(ShardError, match=r"holds no index\.parquet\. Pass a folder that"):
         unpack(small_release, tmp_path)
     with pytest.raises(ShardError, match="is remote"):
         unpack("https://example.org/shards", tmp_path)
     with pytest.raises(ShardError, match="holds the shards themselves"):
-        unpack(packed, packed)
+        unpack(packed_depth, packed_depth)
     with pytest.raises(StorageError, match="does not exist"):
         unpack(tmp_path / "nothing", tmp_path / "tree")
 
 
-def test_the_commands_pack_and_unpack(small_release, packed, tmp_path):
+def test_the_commands_pack_and_unpack(small_release, packed_depth, tmp_path):
     out, tree = tmp_path / "shards", tmp_path / "tree"
     succeed("pack", small_release, out, "--depth-codec", "blosc2", "--workers", "1")
     second, third = (succeed("unpack", out, tree) for _ in range(2))
 
-    assert bytes_of(out) == bytes_of(packed)
+    assert bytes_of(out) == bytes_of(packed_depth)
     assert second.stdout == f"{tree}: 4 scenes unpacked, 0 kept\n"
     assert third.stdout == f"{tree}: 0 scenes unpacked, 4 kept\n"

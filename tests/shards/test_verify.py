@@ -29,12 +29,6 @@ FETCH = "Fetch the shard again, or pack it again."
 
 
 @pytest.fixture
-def shards(small_shards, tmp_path):
-    """A copy of three sound shards, the one for Uniform with two scenes."""
-    return shutil.copytree(small_shards, tmp_path / "shards")
-
-
-@pytest.fixture
 def place(shards):
     """Where a file of the index lies."""
     scenes = scenes_of(shards)

@@ -16,10 +16,6 @@ from tests.servers.tools import files_of
 SMALL = {"size_px": 32, "frames": 2, "seed": 9}
 
 
-def contents(folder):
-    return {path.name: path.read_bytes() for path in folder.iterdir()}
-
-
 @pytest.mark.parametrize(
     ("asked", "folder"),
     [
@@ -35,7 +31,7 @@ def test_scenes_are_written_to_the_folders_of_the_release(tmp_path, asked, folde
 
     assert synthesise(tmp_path, SynthRequest(**asked, **SMALL)) == [key]
     assert {path.name for path in tmp_path.iterdir()} == {key.split("/")[0], ".generation"}
-    assert len(contents(tmp_path / key)) == 17
+    assert len(files_of(tmp_path / key)) == 17
 
 
 def test_an_interrupted_run_of_two_processes_goes_on_to_the_same_scenes_as_one_alone(tmp_path):
@@ -61,9 +57,9 @@ def test_an_interrupted_run_of_two_processes_goes_on_to_the_same_scenes_as_one_a
     (alone,) = synthesise(tmp_path / "alone", SynthRequest(scenes=1, **small))
 
     assert {folder: folder.stat().st_mtime_ns for folder in finished} == before
-    assert len(contents(tmp_path / first)) == len(contents(tmp_path / second)) == 17
-    assert contents(tmp_path / first) == contents(tmp_path / "alone" / alone)
-    assert contents(tmp_path / first) != contents(tmp_path / second)
+    assert len(files_of(tmp_path / first)) == len(files_of(tmp_path / second)) == 17
+    assert files_of(tmp_path / first) == files_of(tmp_path / "alone" / alone)
+    assert files_of(tmp_path / first) != files_of(tmp_path / second)
 
 
 def test_incomplete_scenes_of_a_killed_run_are_rendered_again(tmp_path):
@@ -78,7 +74,7 @@ def test_incomplete_scenes_of_a_killed_run_are_rendered_again(tmp_path):
 
     (key,) = synthesise(tmp_path, request)
 
-    assert len(contents(tmp_path / key)) == 17
+    assert len(files_of(tmp_path / key)) == 17
     assert not stale.exists()
 
 
@@ -126,5 +122,5 @@ def test_two_runs_do_not_draw_the_same_part_at_once_and_other_parts_side_by_side
 
     (first,) = synthesise(tmp_path, request, part=(1, 2), progress=second_run)
 
-    assert len(contents(tmp_path / first)) == 17
+    assert len(files_of(tmp_path / first)) == 17
     assert not list(tmp_path.glob(".generation/*/"))
