@@ -65,9 +65,9 @@ def drawn(tmp_path_factory):
     """Return the folder of a scene that is drawn once for all tests; not to be changed."""
 
     @cache
-    def drawn(request, renderer=RAY_CASTING):
+    def drawn(request, renderer=RAY_CASTING, part=(1, 1)):
         root = tmp_path_factory.mktemp("drawn")
-        (key,) = synthesise(root, request, renderer=renderer)
+        (key,) = synthesise(root, request, renderer=renderer, part=part)
         return root / key
 
     return drawn
@@ -513,36 +513,24 @@ def test_where_most_places_are_wrong_no_camera_is_named(two_wide_scenes, tmp_pat
     ]
 
 
-@pytest.fixture
-def verdict_on_map(tmp_path):
-    """Draw the scene of a seed in one of all maps, make one thing wrong, and return the verdict."""
-
-    def verdict_on_map(family, corrupt, *, seed, number):
-        request = SynthRequest(
-            family=family, map_name=RAY_CASTING.maps, size_px=96, frames=9, seed=seed, scenes=3
-        )
-        (key,) = synthesise(tmp_path, request, part=(number, 3))
-        corrupt(tmp_path / key)
-        (verdict,) = diagnose(tmp_path, workers=1).verdicts
-        return verdict
-
-    return verdict_on_map
+def of_all_maps(family, *, seed, number, scenes=3, size_px=96):
+    """Return how one of some scenes is drawn whose maps are any."""
+    of = {"family": family, "size_px": size_px, "seed": seed, "scenes": scenes, "frames": 9}
+    return SynthRequest(map_name=RAY_CASTING.maps, **of), RAY_CASTING, (number, scenes)
 
 
-def test_a_camera_elsewhere_does_not_make_the_quotient_of_all_wrong(verdict_on_map):
-    verdict = verdict_on_map(
-        "IPD_Gaussian", lambda folder: place_cameras(folder, {5: 0.95}), seed=12, number=2
-    )
+def test_a_camera_elsewhere_does_not_make_the_quotient_of_all_wrong(verdict_on):
+    scene = of_all_maps("IPD_Gaussian", seed=12, number=2)
+    verdict = verdict_on(lambda folder: place_cameras(folder, {5: 0.95}), of=scene, frames=4)
 
     assert verdict.contradicted == []
     assert answer(verdict, QUOTIENT).status == "cannot tell"
 
 
-def test_depth_is_not_accused_at_matches_that_are_false(verdict_on_map):
+def test_depth_is_not_accused_at_matches_that_are_false(verdict_on):
     """The outermost camera is so far away that no other pair is as wide."""
-    verdict = verdict_on_map(
-        "Uniform", pictures_of(5, lambda seen: seen[:, ::-1]), seed=11, number=1
-    )
+    scene = of_all_maps("Uniform", seed=11, number=1)
+    verdict = verdict_on(pictures_of(5, lambda seen: seen[:, ::-1]), of=scene, frames=4)
 
     assert verdict.contradicted == []
     assert verdict.unexplained_cameras == (5,)
@@ -650,13 +638,10 @@ def test_ray_depth_is_not_taken_for_what_explains_few_of_the_matches(verdict_on)
     assert not verdict.fits
 
 
-def test_a_lag_that_moves_predictions_by_less_than_a_tenth_of_a_pixel_was_not_tested(tmp_path):
+def test_a_lag_that_moves_predictions_by_less_than_a_tenth_of_a_pixel_was_not_tested(verdict_on):
     """Where pictures move by 0.01 px a frame, their codec repeats parts of earlier ones."""
-    request = SynthRequest(
-        family="IPD_Gaussian", map_name=RAY_CASTING.maps, size_px=128, frames=9, seed=1, scenes=4
-    )
-    synthesise(tmp_path, request, part=(4, 4))
-    (verdict,) = diagnose(tmp_path, workers=1, frames=1).verdicts
+    scene = of_all_maps("IPD_Gaussian", seed=1, number=4, scenes=4, size_px=128)
+    verdict = verdict_on(lambda folder: None, of=scene)
 
     lag = answer(verdict, "frame lag")
 

@@ -112,9 +112,8 @@ def test_a_card_is_replaced_but_another_readme_is_not(tmp_path):
     assert MARK in (tmp_path / "README.md").read_text()
     assert "a/c" in (tmp_path / "README.md").read_text()
     (tmp_path / "README.md").write_text("mine")
-    with pytest.raises(
-        DescriptorError, match=r"README\.md: exists and was not written by this package"
-    ):
+    match = r"README\.md: exists and was not written by this package"
+    with pytest.raises(DescriptorError, match=match):
         write_card(index, tmp_path, repository="a/b")
 
 

@@ -244,7 +244,6 @@ def test_the_wrong_suffix_of_depth_is_named(packed_depth):
 
     with pytest.raises(StorageError, match=r'no cam_00_depth\.mkv.*features\(depth_suffix="b2f'):
         huggingface.decode(FIELDS)(row)
-    with pytest.raises(
-        SelectionError, match=r"depth_suffix must be 'mkv' or 'b2frame', got 'b2nd'"
-    ):
+    match = r"depth_suffix must be 'mkv' or 'b2frame', got 'b2nd'"
+    with pytest.raises(SelectionError, match=match):
         huggingface.features(depth_suffix="b2nd")

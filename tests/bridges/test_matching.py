@@ -206,11 +206,11 @@ def test_cameras_that_stand_from_right_to_left_need_the_other_direction(
     places_m = tuple(-place_m for place_m in scene.lateral_m)
     index = SceneIndex.from_scenes([replace(scene, lateral_m=places_m)], indexed_release)
 
-    with pytest.raises(
-        SelectionError,
-        match=rf"{scene.id.key}: .*camera 0 is the first.*right of camera 1.*15 pairs of 15.*"
-        rf"{adapter.__name__}",
-    ):
+    match = (
+        rf"{scene.id.key}: .*camera 0 is the first.*right of camera 1.*15 pairs of 15.*"
+        rf"{adapter.__name__}"
+    )
+    with pytest.raises(SelectionError, match=match):
         adapter(index, pairs="all", **options)
     assert len(adapter(index, pairs="all", direction="right_to_left", **options)) > 0
 

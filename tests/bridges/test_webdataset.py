@@ -130,7 +130,6 @@ def test_a_key_that_is_not_a_scene_path_is_refused(scenes, key):
 
 
 def test_an_unknown_option_is_named():
-    with pytest.raises(
-        SelectionError, match=r"decode has no option 'split'; it is an option of an earlier stage"
-    ):
+    match = r"decode has no option 'split'; it is an option of an earlier stage"
+    with pytest.raises(SelectionError, match=match):
         decode(("left",), split="train")

@@ -142,9 +142,8 @@ def test_a_slice_is_answered_with_a_subset_of_the_same_samples(indexed_release):
 
 @pytest.mark.parametrize("data", [None, ["scenes"]], ids=repr)
 def test_what_is_not_a_path_is_named_with_what_is_one(data):
-    with pytest.raises(
-        StorageError, match=rf"{re.escape(repr(data))} is not a path: name a folder"
-    ):
+    match = rf"{re.escape(repr(data))} is not a path: name a folder"
+    with pytest.raises(StorageError, match=match):
         StereoPairs(data)
 
 

@@ -105,11 +105,11 @@ def test_a_server_that_dies_in_the_middle_is_reported_once(large_shards, impatie
     with serving(large_shards) as web:
         pairs = StereoPairs(web.url, frames="all")
         assert "disparity" in pairs[0]
-    with pytest.raises(
-        StorageError,
-        match=rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar : cannot be read, "
-        r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network",
-    ):
+    match = (
+        rf"scene_000000, frames \(6,\): {web.url}/train-Uniform-000000.tar : cannot be read, "
+        r"at byte \d+ of \d+ \(.*Connection refused; 10 tries\). Check the network"
+    )
+    with pytest.raises(StorageError, match=match):
         pairs[6]
     assert capsys.readouterr().err == ""
 

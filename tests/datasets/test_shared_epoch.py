@@ -146,9 +146,8 @@ def test_an_epoch_that_was_set_again_may_be_repeated(small_index, ordered_by):
         pairs.set_epoch(0)
         list(loader)
 
-    with pytest.warns(
-        RepeatedEpochWarning, match="4 of .* samples .*of 4 scenes.* epoch 0 come a second"
-    ) as told:
+    match = "4 of .* samples .*of 4 scenes.* epoch 0 come a second"
+    with pytest.warns(RepeatedEpochWarning, match=match) as told:
         list(loader)
     assert told[0].filename == __file__
     assert keys_of(loader) == keys_of(loader)

@@ -189,9 +189,8 @@ def test_where_no_cluster_runs_none_is_started(monkeypatch):
     monkeypatch.setattr(module, "is_initialized", lambda: False)
     monkeypatch.setattr(module, "init", nowhere)
 
-    with pytest.raises(
-        StorageError, match=r"auto: no Ray cluster .* Start a cluster with `ray start"
-    ):
+    match = r"auto: no Ray cluster .* Start a cluster with `ray start"
+    with pytest.raises(StorageError, match=match):
         list(RayCluster().map(pid, [1], name=called))
 
 

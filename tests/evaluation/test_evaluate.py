@@ -153,11 +153,11 @@ def test_a_missing_prediction_is_an_error_before_anything_is_scored(scored_index
     shutil.rmtree(copied / item_name(scene, (0, 1)))
     done = []
 
-    with pytest.raises(
-        EvaluationError,
-        match=rf"1 prediction missing or unusable, and 0 allowed.*{scene}.* expected a "
-        rf"folder or video {scene}/00-01 or {item_name(scene, (0, 1))}\.$",
-    ):
+    match = (
+        rf"1 prediction missing or unusable, and 0 allowed.*{scene}.* expected a "
+        rf"folder or video {scene}/00-01 or {item_name(scene, (0, 1))}\.$"
+    )
+    with pytest.raises(EvaluationError, match=match):
         scored(scored_index, copied, protocol, progress=lambda *counts: done.append(counts))
     assert done == []
 
@@ -231,9 +231,8 @@ def test_a_callable_whose_scores_are_kept_must_be_named_before_anything_is_done(
     out = tmp_path / "out"
 
     for nameless in ({}, {"name": None}, {"name": ""}):
-        with pytest.raises(
-            EvaluationError, match=rf"out: is to keep the scores of {called},.* Pass name="
-        ):
+        match = rf"out: is to keep the scores of {called},.* Pass name="
+        with pytest.raises(EvaluationError, match=match):
             scored(scored_index, method, protocol, out=out, **nameless)
     assert not out.exists()
 
@@ -242,9 +241,8 @@ def test_kept_scores_are_those_of_the_name_alone(scored_index, protocol, tmp_pat
     whole, half = Faded(1.0), Faded(0.5)
     first = scored(scored_index, whole, protocol, name="whole", out=tmp_path)
 
-    with pytest.raises(
-        EvaluationError, match=r"other methods: \['whole'\], where \['half'\] is asked for"
-    ):
+    match = r"other methods: \['whole'\], where \['half'\] is asked for"
+    with pytest.raises(EvaluationError, match=match):
         scored(scored_index, half, protocol, name="half", out=tmp_path)
     again = scored(scored_index, whole, protocol, name="whole", out=tmp_path)
 
@@ -276,10 +274,8 @@ def test_a_matcher_of_the_same_name_in_another_file_is_another_one(
     for _ in range(2):
         scored(scored_index, right_views, protocol, frames=[0], out=tmp_path / "out")
     monkeypatch.chdir(tmp_path / "two")
-    with pytest.raises(
-        EvaluationError,
-        match=r"other matchers: \['sift', '.*one/mine\.py:Mine'\], where .*two/mine",
-    ):
+    match = r"other matchers: \['sift', '.*one/mine\.py:Mine'\], where .*two/mine"
+    with pytest.raises(EvaluationError, match=match):
         scored(scored_index, right_views, protocol, frames=[0], out=tmp_path / "out")
 
 

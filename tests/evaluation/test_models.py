@@ -65,10 +65,8 @@ def test_a_file_that_is_damaged_or_holds_more_than_tensors_is_named_and_not_run(
     path = tmp_path / "weights.pth"
     path.write_bytes(content) if isinstance(content, bytes) else torch.save(content, path)
 
-    with pytest.raises(
-        EvaluationError,
-        match=f"{re.escape(str(path))}: .* cannot be read as tensors only.* Fetch the file again",
-    ):
+    match = f"{re.escape(str(path))}: .* cannot be read as tensors only.* Fetch the file again"
+    with pytest.raises(EvaluationError, match=match):
         load_file(torch.nn.Linear(1, 1), path)
 
 

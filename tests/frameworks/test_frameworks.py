@@ -150,9 +150,8 @@ def test_a_shuffled_loader_that_lightning_would_overfit_says_what_to_use(
 ):
     pairs = runs.random_frames(indexed_release)
 
-    with pytest.raises(
-        SelectionError, match=r"limit_train_batches=.*pairs.loader\(..., shuffle=Fal"
-    ):
+    match = r"limit_train_batches=.*pairs.loader\(..., shuffle=Fal"
+    with pytest.raises(SelectionError, match=match):
         runs.lightning(pairs.loader(4), tmp_path, overfit_batches=2)
 
 

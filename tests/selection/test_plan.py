@@ -37,9 +37,8 @@ def test_numbers_of_numpy_and_torch_are_numbers(index, kind):
 
 @pytest.mark.parametrize("seed", [1.0, True, "1", torch.tensor(1.0), np.float32(1)], ids=repr)
 def test_a_seed_that_is_no_whole_number_is_refused(index, seed):
-    with pytest.raises(
-        SelectionError, match=f"seed must be .* from 0, got {re.escape(repr(seed))}"
-    ):
+    match = f"seed must be .* from 0, got {re.escape(repr(seed))}"
+    with pytest.raises(SelectionError, match=match):
         plan_pairs(index, seed=seed)
 
 

@@ -48,8 +48,15 @@ def bytes_of(opened):
 class SourceTests:
     """The contract of `MemberSource` and what it reads through, for one kind of place.
 
-    Each kind gives a fixture ``root``: where the data are, a folder or a URL.
+    Each kind gives a fixture ``root``: where the data are, a folder or a URL. Where another fixture
+    is just that, ``place`` names it.
     """
+
+    place = ""
+
+    @pytest.fixture
+    def root(self, request):
+        return request.getfixturevalue(self.place)
 
     @pytest.fixture
     def index(self, small_shards):

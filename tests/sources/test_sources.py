@@ -11,9 +11,7 @@ from tests.sources.source_kit import BASELINE_JSON, SourceTests
 
 
 class TestReleasedFolder(SourceTests):
-    @pytest.fixture
-    def root(self, indexed_release):
-        return indexed_release
+    place = "indexed_release"
 
     @pytest.fixture
     def index(self, indexed_release):
@@ -24,9 +22,7 @@ class TestReleasedFolder(SourceTests):
 
 
 class TestShards(SourceTests):
-    @pytest.fixture
-    def root(self, small_shards):
-        return small_shards
+    place = "small_shards"
 
 
 class TestHttp(SourceTests):
@@ -58,9 +54,7 @@ class TestReleasedFolderOverHttp(TestReleasedFolder):
 
 
 class TestNginx(SourceTests):
-    @pytest.fixture
-    def root(self, nginx):
-        return nginx
+    place = "nginx"
 
 
 class TestHub(SourceTests):
@@ -70,9 +64,7 @@ class TestHub(SourceTests):
 
 
 class TestS3(SourceTests):
-    @pytest.fixture
-    def root(self, s3):
-        return s3
+    place = "s3"
 
 
 class TestOtherFileSystem(SourceTests):

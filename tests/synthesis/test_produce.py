@@ -90,9 +90,8 @@ def test_a_scene_that_another_request_wrote_is_neither_kept_nor_overwritten(tmp_
         ({"contract": ExportContract(depth_unit_m=0.01)}, r"its contract is .*unit_m=0\.01"),
     ):
         for act in (synthesise, plan_scenes):
-            with pytest.raises(
-                SynthesisError, match=rf"scene_000000: another request wrote .*{differs}"
-            ):
+            match = rf"scene_000000: another request wrote .*{differs}"
+            with pytest.raises(SynthesisError, match=match):
                 act(tmp_path, SynthRequest(**(SMALL | other)))
     assert files_of(tmp_path) == before
     (tmp_path / key / "_scene_complete.json").unlink()
