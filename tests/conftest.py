@@ -19,7 +19,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.index.tree_cache import CACHE_VARIABLE
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
-from tests.servers.tools import made_once
+from tests.servers.tools import Once
 
 pytest_plugins = ("tests.servers.fixtures", "tests.servers.scene_fixtures")
 
@@ -105,7 +105,7 @@ def ground_truth() -> Path:
 
 
 @pytest.fixture(scope="session")
-def small_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_release(once: Once) -> Path:
     """A tree of small scenes in the released layout: two families in train, one in eval.
 
     Of those seeds each family has a scene with sky, whose depth is not measured.
@@ -122,22 +122,22 @@ def small_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ):  # fmt: skip
             synthesise(root, request, workers=1)
 
-    return made_once(tmp_path_factory, "small_release", make)
+    return once("small_release", make)
 
 
 @pytest.fixture(scope="session")
-def indexed_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def indexed_release(small_release: Path, once: Once) -> Path:
     """The same tree with an index, which opens at once, for tests that only read it."""
 
     def make(root: Path) -> None:
         shutil.copytree(small_release, root, copy_function=os.link)
         SceneIndex.open(root).write(root / INDEX_NAME)
 
-    return made_once(tmp_path_factory, "indexed_release", make)
+    return once("indexed_release", make)
 
 
 @pytest.fixture(scope="session")
-def detailed_release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def detailed_release(once: Once) -> Path:
     """A tree with one scene of 160 x 160 pixels, large enough for textures to warp well."""
     request = SynthRequest(family="IPD_Gaussian", scenes=1, size_px=160, frames=2, seed=6)
-    return made_once(tmp_path_factory, "detailed_release", lambda root: synthesise(root, request))
+    return once("detailed_release", lambda root: synthesise(root, request))

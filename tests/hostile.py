@@ -1,11 +1,8 @@
 """Code that is given hostile data runs in a process of its own, with little memory and patience."""
 
-import subprocess
-import sys
 from pathlib import Path
 
-_HANGS_S = 240
-"""After how long a process is given up as hanging: hundreds of times what the work takes."""
+from tests.servers.tools import run_python
 
 
 def run_bounded(code: str, *arguments: str | Path, memory_mb: int | None = None) -> str:
@@ -22,12 +19,4 @@ def run_bounded(code: str, *arguments: str | Path, memory_mb: int | None = None)
             f"most = taken + {memory_mb * 2**20}\n"
             "resource.setrlimit(resource.RLIMIT_AS, (most, most))\n"
         )
-    done = subprocess.run(
-        [sys.executable, "-c", code.replace("# bounded\n", bound), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=_HANGS_S,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-3000:]
-    return done.stdout
+    return run_python("-c", code.replace("# bounded\n", bound), *arguments)

@@ -12,7 +12,7 @@ import pytest
 
 import stereogenbench_data
 from tests.cli.command import CALLS
-from tests.servers.tools import chromium, made_once, require_module
+from tests.servers.tools import chromium, require_module, run_python
 
 HOME = Path(__file__).resolve().parents[1]
 
@@ -27,15 +27,14 @@ def pages():
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
+def built(once):
     """The folder of the site as `make docs` makes it, and beside it what the build said."""
     for module in ("mkdocs", "material", "mkdocstrings"):
         require_module(module)
 
     def make(root):
         root.mkdir()
-        made = [sys.executable, "docs/generated_pages.py"]
-        subprocess.run(made, cwd=HOME, check=True, timeout=300)
+        run_python("docs/generated_pages.py")
         done = subprocess.run(
             [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(root / "site")],
             cwd=HOME, capture_output=True, text=True, check=False, timeout=300,
@@ -44,7 +43,7 @@ def built(tmp_path_factory):
         (root / "build.log").write_text(f"{done.stderr}\nexit status {done.returncode}")
 
     # One process of a run builds it, as the pages are made in a folder of the checkout.
-    return made_once(tmp_path_factory, "documentation", make) / "site"
+    return once("documentation", make) / "site"
 
 
 def text_of(site, page):

@@ -1,13 +1,12 @@
 """The package's structure: imports go one way, torch comes late, names are documented."""
 
 import ast
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 import stereogenbench_data
+from tests.servers.tools import run_python
 
 PACKAGE = Path(stereogenbench_data.__file__).parent
 LAYERS = (
@@ -74,10 +73,7 @@ def test_modules_that_do_not_need_torch_start_without_it():
         "    importlib.import_module(name)\n"
         "    if 'torch' in sys.modules: sys.exit(f'{name} imports torch')"
     )
-
-    ended = subprocess.run([sys.executable, "-c", code, *modules], check=False, capture_output=True)
-
-    assert (ended.returncode, ended.stderr.decode()) == (0, "")
+    run_python("-c", code, *modules)
 
 
 def test_what_no_first_sample_needs_is_not_imported_with_the_package():
@@ -88,9 +84,7 @@ def test_what_no_first_sample_needs_is_not_imported_with_the_package():
     }  # fmt: skip
     code = "import sys; from stereogenbench_data import StereoPairs; print(*sys.modules)"
 
-    imported = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True).stdout
-
-    assert unneeded.isdisjoint(imported.decode().split())
+    assert unneeded.isdisjoint(run_python("-c", code).split())
 
 
 def test_every_public_name_can_be_imported_and_has_a_docstring():

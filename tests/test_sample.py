@@ -1,9 +1,7 @@
 """The sample in the repository: small, sound, made by its README's commands, reproducible."""
 
 import re
-import subprocess
 import tarfile
-from pathlib import Path
 
 import pytest
 
@@ -11,10 +9,9 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.plan import parse_bytes
 from stereogenbench_data.shards.verify import verify
-from tests.servers.tools import require_tool
+from tests.servers.tools import CHECKOUT, planned_by_make
 
-PROJECT = Path(__file__).resolve().parents[1]
-SAMPLE = PROJECT / "shards"
+SAMPLE = CHECKOUT / "shards"
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +51,7 @@ def test_the_sample_unpacked_and_packed_again_is_the_same(commands, tmp_path):
 
 
 def test_the_readme_has_the_commands_of_make_sample(commands):
-    planned = subprocess.run(
-        [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "sample"],
-        cwd=PROJECT, capture_output=True, text=True, check=True,
-    )  # fmt: skip
+    planned = planned_by_make("sample").splitlines()
 
-    run = [line.removeprefix(".venv/bin/") for line in planned.stdout.splitlines()]
+    run = [line.removeprefix(".venv/bin/") for line in planned]
     assert [line for line in run if re.match("stereogenbench (synth|pack)", line)] == commands

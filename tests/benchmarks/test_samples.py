@@ -1,16 +1,11 @@
 """Contestants load the same samples, so that races compare nothing but speed."""
 
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from benchmarks.ffmpeg_links import link_libraries
-
-CHECKOUT = Path(__file__).resolve().parents[2]
+from tests.servers.tools import run_python
 
 COMPARED = ("all-pairs-832", "clips")
 """Every contestant and every kind of sample is in these."""
@@ -30,17 +25,11 @@ def differences(material):
         "material = Material(Path(sys.argv[1]), size_px=64, frames=4); "
         "print(json.dumps(differences(material, only=sys.argv[2:])))"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(material.root), *COMPARED],
-        cwd=CHECKOUT,
-        env=os.environ | {"LD_LIBRARY_PATH": str(links or ""), "OMP_NUM_THREADS": "1"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    libraries = {"LD_LIBRARY_PATH": str(links or ""), "OMP_NUM_THREADS": "1"}
+    printed = run_python("-c", code, material.root, *COMPARED, **libraries)
     return {
         (workload, name): found
-        for workload, contestants in json.loads(done.stdout).items()
+        for workload, contestants in json.loads(printed).items()
         for name, found in contestants.items()
     }
 

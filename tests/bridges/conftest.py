@@ -5,7 +5,7 @@ import pytest
 
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
-from tests.servers.tools import made_once, require_module
+from tests.servers.tools import require_module
 
 
 @pytest.fixture(scope="session")
@@ -14,14 +14,12 @@ def urls(small_shards):
 
 
 @pytest.fixture(scope="session")
-def derived_shards(small_release, tmp_path_factory):
+def derived_shards(small_release, once):
     """Two cameras of the scenes of `small_release` in training shards."""
     require_module("blosc2")
     settings = TrainingSettings((32, 48), "small", (0, 3))
-    return made_once(
-        tmp_path_factory,
-        "derived_shards",
-        lambda out: pack(small_release, out, training=settings, workers=1),
+    return once(
+        "derived_shards", lambda out: pack(small_release, out, training=settings, workers=1)
     )
 
 

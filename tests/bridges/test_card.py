@@ -1,11 +1,8 @@
 """The dataset card: for people, and for `datasets`."""
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -16,7 +13,7 @@ from stereogenbench_data.bridges.card import MARK, card, write_card
 from stereogenbench_data.errors import DescriptorError
 from tests.servers.failing_server import serving
 from tests.servers.hub import REPOSITORY, HubHandler
-from tests.servers.tools import require_module
+from tests.servers.tools import require_module, run_python
 from tests.shards.shard_files import scenes_of
 
 SAMPLE = Path(__file__).resolve().parents[2] / "shards"
@@ -86,13 +83,9 @@ def test_load_dataset_finds_configs_and_splits_and_leaves_videos_as_bytes(tmp_pa
 
     with serving(folder, handler=HubHandler) as server:
         settings = {"HF_ENDPOINT": server.url, "HF_HOME": str(tmp_path / "home")}
-        done = subprocess.run(
-            [sys.executable, "-c", LOAD, REPOSITORY, json.dumps(wanted)],
-            capture_output=True, text=True, check=False, timeout=120, env=os.environ | settings,
-        )  # fmt: skip
+        printed = run_python("-c", LOAD, REPOSITORY, json.dumps(wanted), **settings)
 
-    assert done.returncode == 0, done.stderr[-3000:]
-    found = json.loads(done.stdout)
+    found = json.loads(printed)
     assert len(found["None train"]) == 4, "without a config: all families"
     scenes = scenes_of(SAMPLE)
     assert [row[0] for row in found["Uniform train"]] == [

@@ -1,12 +1,9 @@
 """Descriptors, as mlcroissant validates and loads them."""
 
 import json
-import os
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -19,7 +16,7 @@ from stereogenbench_data.shards.download import download, wanted_files
 from stereogenbench_data.shards.pack import pack
 from tests.bridges.validation import problems_of
 from tests.cli.command import succeed
-from tests.servers.tools import require_tool
+from tests.servers.tools import planned_by_make, run_python
 from tests.shards.shard_files import scenes_of
 
 HOME = Path(__file__).resolve().parents[2]
@@ -29,13 +26,7 @@ LOADER = Path(__file__).with_name("load_records.py")
 
 def loaded(cache, *paths):
     """Return the records of descriptors, which a process of its own loads."""
-    done = subprocess.run(
-        [sys.executable, str(LOADER), *map(str, paths)],
-        capture_output=True, text=True, check=False, timeout=300,
-        env=os.environ | {"CROISSANT_CACHE": str(cache)},
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr[-3000:]
-    return json.loads(done.stdout)
+    return json.loads(run_python(LOADER, *paths, CROISSANT_CACHE=str(cache)))
 
 
 def stored(index, form, *, cameras=range(6)):
@@ -135,10 +126,7 @@ def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(
 def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeypatch):
     copied = tmp_path / "croissant"
     shutil.copytree(HOME / "shards", tmp_path / "shards")
-    planned = subprocess.run(
-        [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", "descriptors"],
-        cwd=HOME, capture_output=True, text=True, check=True,
-    ).stdout.replace("\\\n", " ")  # fmt: skip
+    planned = planned_by_make("descriptors").replace("\\\n", " ")
     commands = re.findall(r"^\S*stereogenbench (publish croissant .*)", planned, re.MULTILINE)
     monkeypatch.chdir(tmp_path)
 

@@ -3,13 +3,12 @@
 import ast
 import re
 import shlex
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.cli.command import CALLS, COMMANDS, invoke, one_line
+from tests.servers.tools import run_python
 
 HOME = Path(__file__).resolve().parents[2]
 
@@ -95,6 +94,4 @@ def test_help_imports_neither_torch_nor_numpy():
         "heavy = {'torch', 'numpy', 'pyarrow', 'av', 'PIL', 'ray'} & sys.modules.keys()\n"
         "sys.exit(f'imported {heavy}' if heavy else 0)"
     )
-    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, check=False)
-
-    assert ended.returncode == 0, ended.stderr.decode()
+    run_python("-c", code)

@@ -14,7 +14,6 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.media import depth
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
-from tests.servers.tools import made_once
 
 
 @pytest.fixture(scope="session")
@@ -118,7 +117,7 @@ def same(one, other):
 
 
 @pytest.fixture(scope="session")
-def drawn(tmp_path_factory):
+def drawn(once):
     """A tree of one scene of 17 frames, of which tests alter copies."""
     request = SynthRequest(size_px=72, frames=17, seed=3)
-    return made_once(tmp_path_factory, "drawn", lambda root: synthesise(root, request))
+    return once("drawn", lambda root: synthesise(root, request))

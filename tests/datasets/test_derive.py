@@ -1,9 +1,6 @@
 """Pairs derived from views on torch tensors, against the pairs that samples are made of."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,8 +28,8 @@ from stereogenbench_data.samples.fields import Request, SampleWriter, new_array
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from stereogenbench_data.selection.plan import Address
 from tests.samples.test_derive import facts
+from tests.servers.tools import run_python
 
-ROOT = Path(__file__).resolve().parents[2]
 SIZE = (12, 40)
 FRAMES = (0, 1)
 CONTRACTS = {
@@ -242,12 +239,9 @@ def test_autocast_halves_no_precision():
 
 
 def test_torch_compile_takes_it_as_one_graph():
-    command = [sys.executable, "-W", "error", "-m", "tests.datasets.compile_derive", "aot_eager"]
+    printed = run_python("-W", "error", "-m", "tests.datasets.compile_derive", "aot_eager")
 
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-
-    assert done.returncode == 0, done.stderr[-3000:]
-    assert done.stdout.count("17 fields are equal") == 2
+    assert printed.count("17 fields are equal") == 2
 
 
 def test_results_stay_on_the_device_that_is_asked_for():

@@ -11,7 +11,6 @@ from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.datasets.conftest import write_again
-from tests.servers.tools import made_once
 
 FRAMES = 20
 KEY_FRAMES = (0, 8, 16)
@@ -30,13 +29,13 @@ def runs_of_eight_frames(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
+def whole(once):
     request = SynthRequest(map_name="SynthRoom", scenes=2, size_px=48, frames=FRAMES, seed=5)
-    return made_once(tmp_path_factory, "without_keys", lambda root: synthesise(root, request))
+    return once("without_keys", lambda root: synthesise(root, request))
 
 
 @pytest.fixture(scope="module")
-def keyed_release(whole, tmp_path_factory):
+def keyed_release(whole, once):
     """The same scenes with a key frame every 8 frames."""
 
     def make(root):
@@ -44,7 +43,7 @@ def keyed_release(whole, tmp_path_factory):
         for path in sorted(root.rglob("*_rgb.mp4")):
             encode_again(path, key_every=8)
 
-    return made_once(tmp_path_factory, "with_keys", make)
+    return once("with_keys", make)
 
 
 def epoch_of(loader):

@@ -4,7 +4,6 @@ import gc
 import os
 import pickle
 import re
-import subprocess
 import sys
 import threading
 import types
@@ -41,6 +40,7 @@ from stereogenbench_data import (
 )
 from stereogenbench_data.media import depth
 from tests.datasets.conftest import fork_and, same
+from tests.servers.tools import run_python
 
 EVERY_FIELD = tuple(PAIR_FIELDS)
 
@@ -401,7 +401,7 @@ def test_reading_samples_does_not_import_pandas(small_shards):
         "import sys; from stereogenbench_data import StereoPairs; "
         "StereoPairs(sys.argv[1])[0]; sys.exit('pandas' in sys.modules)"
     )
-    assert subprocess.run([sys.executable, "-c", code, small_shards], check=False).returncode == 0
+    run_python("-c", code, small_shards)
 
 
 MIXED = r"no split was chosen, so 1 eval and 3 train scenes come together"

@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -16,6 +15,7 @@ from stereogenbench_data.engine import Engine, RayCluster
 from stereogenbench_data.errors import ExtraError, ShardError, StorageError
 from stereogenbench_data.shards.pack import pack
 from stereogenbench_data.shards.training import TrainingSettings
+from tests.cli.command import run
 from tests.servers.tools import files_of, require_module
 
 
@@ -168,11 +168,8 @@ def test_the_command_works_on_a_cluster_by_its_address_with_relative_paths(
     pack(small_release, tmp_path / "here", target_bytes=250_000, workers=1)
     (tmp_path / "scenes").symlink_to(small_release)
 
-    ended = subprocess.run(
-        [sys.executable, "-m", "stereogenbench_data.cli.main", "pack", "scenes", "out",
-         "--shard-size", "250kB", "--workers", cluster],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = ("pack", "scenes", "out", "--shard-size", "250kB", "--workers", cluster)
+    ended = run(*words, cwd=tmp_path)
 
     assert ended.returncode == 0, ended.stderr
     assert "4 shards packed, 0 kept" in ended.stdout

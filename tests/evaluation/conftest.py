@@ -14,14 +14,13 @@ from stereogenbench_data.evaluation.tables import Scores
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
-from tests.servers.tools import made_once
 
 FRAMES = 4
 SIZE = (48, 64)
 
 
 @pytest.fixture(scope="session")
-def scored_index(tmp_path_factory) -> SceneIndex:
+def scored_index(once) -> SceneIndex:
     """Three scenes of eval, two families and both subsets, 64 px and 4 frames."""
 
     def make(root: Path) -> None:
@@ -35,7 +34,7 @@ def scored_index(tmp_path_factory) -> SceneIndex:
             )  # fmt: skip
             synthesise(root, request, workers=1)
 
-    return SceneIndex.open(made_once(tmp_path_factory, "scored_scenes", make))
+    return SceneIndex.open(once("scored_scenes", make))
 
 
 @pytest.fixture
@@ -91,16 +90,12 @@ def photograph(path: Path) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def right_views(scored_index, tmp_path_factory) -> Path:
+def right_views(scored_index, once) -> Path:
     """The rendered right views of all scenes as predictions; not to be changed."""
-    return made_once(
-        tmp_path_factory, "right_views", lambda folder: write_pngs(folder, scored_index)
-    )
+    return once("right_views", lambda folder: write_pngs(folder, scored_index))
 
 
 @pytest.fixture(scope="session")
-def other_views(scored_index, tmp_path_factory) -> Path:
+def other_views(scored_index, once) -> Path:
     """The views of camera 2 as predictions of camera 1; not to be changed."""
-    return made_once(
-        tmp_path_factory, "other_views", lambda folder: write_pngs(folder, scored_index, camera=2)
-    )
+    return once("other_views", lambda folder: write_pngs(folder, scored_index, camera=2))

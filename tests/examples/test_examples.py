@@ -4,7 +4,6 @@ import json
 import re
 import runpy
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from PIL import Image
 
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.selection.filters import find_scene
+from tests.servers.tools import run_python
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 SHARDS = EXAMPLES.parent / "shards"
@@ -136,14 +136,11 @@ def test_a_killed_run_of_two_ranks_goes_on_in_mid_epoch_and_takes_each_sample_on
     """Of the 12 batches of an epoch and rank 6 are saved; another epoch follows."""
     saved, epoch = 6, 12
 
-    ran = subprocess.run(
-        [sys.executable, "-m", "tests.examples.watched", tmp_path, EXAMPLES / "distributed.py"],
-        cwd=EXAMPLES.parent, capture_output=True, text=True, check=False, timeout=240,
-    )  # fmt: skip
+    printed = run_python("-m", "tests.examples.watched", tmp_path, EXAMPLES / "distributed.py")
 
     killed, done = json.loads((tmp_path / "ends.json").read_text())
     assert -signal.SIGKILL in killed
-    assert done == [0, 0], ran.stderr[-3000:]
+    assert done == [0, 0]
     before, going_on = (
         [json.loads((tmp_path / f"{run}.{rank}").read_text()) for rank in range(2)]
         for run in ("killed", "done")
@@ -158,7 +155,7 @@ def test_a_killed_run_of_two_ranks_goes_on_in_mid_epoch_and_takes_each_sample_on
         assert len(set(names)) == len(names) == 2 * epoch * len(batches[0])
     assert whole[0][:epoch] != whole[0][epoch:]
     # Two processes write here, so that ends of lines may come between.
-    said = {*re.findall(r"rank \d: epoch \d", ran.stdout)}
+    said = {*re.findall(r"rank \d: epoch \d", printed)}
     assert said == {f"rank {rank}: epoch {number}" for rank in range(2) for number in range(2)}
 
 

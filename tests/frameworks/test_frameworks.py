@@ -4,16 +4,14 @@ Each sample comes once an epoch, epochs differ, and a run that goes on equals th
 """
 
 import json
-import subprocess
-import sys
 from importlib import import_module
-from pathlib import Path
 
 import pytest
 from accelerate import skip_first_batches
 
 from stereogenbench_data import SelectionError, StereoPairs
 from tests.datasets.conftest import flat, keys_of
+from tests.servers.tools import run_python
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning:lightning"),
@@ -32,11 +30,7 @@ def runs():
 def ranks(indexed_release, tmp_path_factory):
     """What two real processes found, by rank."""
     out = tmp_path_factory.mktemp("ranks")
-    ended = subprocess.run(
-        [sys.executable, "-m", "tests.frameworks.ranks", indexed_release, out],
-        cwd=Path(__file__).parents[2], capture_output=True, text=True, timeout=240, check=False,
-    )  # fmt: skip
-    assert ended.returncode == 0, ended.stderr
+    run_python("-m", "tests.frameworks.ranks", indexed_release, out)
     return [json.loads((out / f"rank{rank}.json").read_text()) for rank in range(2)]
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import fsspec
@@ -12,7 +13,7 @@ from stereogenbench_data.shards.pack import pack
 from tests.servers.failing_server import FailingServer, serving
 from tests.servers.hub import hub_serving
 from tests.servers.nginx import nginx_serving
-from tests.servers.tools import made_once, require_module, require_tool, rewrite_json
+from tests.servers.tools import Once, made_once, require_module, require_tool, rewrite_json
 from tests.servers.videos import write_depth, write_rgb
 
 BUCKET = "some-bucket"
@@ -20,22 +21,23 @@ NOISE_PX = 320
 
 
 @pytest.fixture(scope="session")
-def small_shards(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The scenes of `small_release` in shards."""
-    return made_once(
-        tmp_path_factory, "small_shards", lambda out: pack(small_release, out, workers=1)
-    )
+def once(tmp_path_factory: pytest.TempPathFactory) -> Once:
+    """Return a folder of a name that a function has made, once for all processes of a run."""
+    return partial(made_once, tmp_path_factory)
 
 
 @pytest.fixture(scope="session")
-def packed_depth(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small_shards(small_release: Path, once: Once) -> Path:
+    """The scenes of `small_release` in shards."""
+    return once("small_shards", lambda out: pack(small_release, out, workers=1))
+
+
+@pytest.fixture(scope="session")
+def packed_depth(small_release: Path, once: Once) -> Path:
     """The scenes of `small_release` in shards whose depth blosc2 packed."""
     require_module("blosc2")
-    return made_once(
-        tmp_path_factory,
-        "packed_depth",
-        lambda out: pack(small_release, out, workers=1, depth_codec="blosc2"),
-    )
+    how = {"depth_codec": "blosc2", "workers": 1}
+    return once("packed_depth", lambda out: pack(small_release, out, **how))
 
 
 @pytest.fixture
@@ -45,7 +47,7 @@ def shards(small_shards: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large_release(small_release: Path, once: Once) -> Path:
     """One scene whose videos are noise: far larger than what is fetched at once."""
     key = "train/Uniform/SynthStage/scene_000000"
 
@@ -61,15 +63,13 @@ def large_release(small_release: Path, tmp_path_factory: pytest.TempPathFactory)
             units = noise.integers(1, 65535, (7, *size), dtype=np.uint16)
             write_depth(path, units, tags={"DEPTH_SCALE": "0.1"})
 
-    return made_once(tmp_path_factory, "large_release", make)
+    return once("large_release", make)
 
 
 @pytest.fixture(scope="session")
-def large_shards(large_release: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def large_shards(large_release: Path, once: Once) -> Path:
     """The scene of `large_release` in a shard."""
-    return made_once(
-        tmp_path_factory, "large_shards", lambda out: pack(large_release, out, workers=1)
-    )
+    return once("large_shards", lambda out: pack(large_release, out, workers=1))
 
 
 @pytest.fixture

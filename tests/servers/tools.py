@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -15,6 +16,10 @@ from typing import Any
 
 import pytest
 from filelock import FileLock
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+Once = Callable[[str, Callable[[Path], object]], Path]
+"""What makes a folder of a name, of the fixture `once`."""
 
 
 def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], object]) -> Path:
@@ -95,6 +100,26 @@ def wait_until(condition: Callable[[], object]) -> None:
     while not condition():
         assert time.monotonic() < deadline_s, "it did not come about within a minute"
         time.sleep(0.01)
+
+
+def run_python(*words: object, **variables: str) -> str:
+    """Return what Python prints, in the checkout, with more variables of the environment.
+
+    Fail where it fails, or hangs: five minutes are many times what tests ask for.
+    """
+    done = subprocess.run(
+        [sys.executable, *map(str, words)], env=os.environ | variables, cwd=CHECKOUT,
+        capture_output=True, text=True, check=False, timeout=300,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def planned_by_make(target: str) -> str:
+    """Return the commands that make runs for a target, once the environment is there."""
+    command = [require_tool("make"), "--dry-run", "--old-file", ".venv/.ready", target]
+    done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=True)
+    return done.stdout
 
 
 def killed_fork(act: Callable[[], object]) -> bool:

@@ -44,7 +44,7 @@ from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
 from tests.cli.command import succeed
 from tests.datasets.conftest import same
-from tests.servers.tools import made_once, require_module
+from tests.servers.tools import require_module
 from tests.shards.shard_files import alter_scene, bytes_of, flip_byte, scenes_of
 
 SIZE = (24, 32)
@@ -60,7 +60,7 @@ def blosc2():
 
 
 @pytest.fixture(scope="module")
-def release(tmp_path_factory):
+def release(once):
     """Three scenes of 18 frames, more than two runs between key frames; not to be changed."""
 
     def make(root):
@@ -69,17 +69,13 @@ def release(tmp_path_factory):
             synthesise(root, request, workers=1)
         SceneIndex.open(root).write(root / "index.parquet")
 
-    return made_once(tmp_path_factory, "training_release", make)
+    return once("training_release", make)
 
 
 @pytest.fixture(scope="module")
-def packed(release, tmp_path_factory):
+def packed(release, once):
     """Its training shards by the default settings; not to be changed."""
-    return made_once(
-        tmp_path_factory,
-        "training_shards",
-        lambda out: pack(release, out, training=SETTINGS, workers=1),
-    )
+    return once("training_shards", lambda out: pack(release, out, training=SETTINGS, workers=1))
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.render import RAY_CASTING
 from stereogenbench_data.synthesis.request import SynthRequest
 from stereogenbench_data.synthesis.scene_files import metadata_texts, write_cameras
-from tests.servers.tools import made_once
 
 UNIT_M = 0.001
 SENSOR_MM = 23.76
@@ -56,13 +55,13 @@ def decoded(path, pixel_format):
 
 
 @pytest.fixture(scope="session")
-def draw(tmp_path_factory):
+def draw(once):
     """Draw one scene, once for all tests: by default 96 px wide, 3 frames."""
 
     def draw_scene(**request):
         asked = SynthRequest(**{"size_px": 96, "frames": 3, "seed": 2} | request)
         name = f"synth_{zlib.crc32(repr(asked).encode())}"
-        out = made_once(tmp_path_factory, name, lambda root: synthesise(root, asked))
+        out = once(name, lambda root: synthesise(root, asked))
         return Drawn(out / asked.key(0))
 
     return draw_scene

@@ -5,8 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import warnings
 from dataclasses import replace
 from itertools import product
@@ -24,7 +22,8 @@ from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.proposal import Proposal, Rig
 from stereogenbench_data.synthesis.renderer import ScenePlan, Spawn
 from stereogenbench_data.synthesis.request import SENSOR_MM, SynthRequest
-from tests.cli.command import invoke
+from tests.cli.command import succeed
+from tests.servers.tools import run_python
 from tests.synthesis.conftest import Drawn
 from tests.synthesis.test_pictures import psnr_db
 
@@ -39,13 +38,7 @@ pytestmark = pytest.mark.skipif(
 def assets(tmp_path_factory):
     """A folder with a yard, a room, a walking figure, and assets that have a fault each."""
     folder = tmp_path_factory.mktemp("blender") / "assets"
-    made = subprocess.run(
-        [sys.executable, str(HERE / "make_blender_assets.py"), str(folder)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert made.returncode == 0, made.stderr
+    run_python(HERE / "make_blender_assets.py", folder)
     return folder
 
 
@@ -230,8 +223,7 @@ def test_depth_is_that_of_another_librarys_rays(renderer, assets, tmp_path):
 
     out = tmp_path / "truth.npz"
     when = 1 + frame / 15 * 24
-    script = [str(HERE / "blender_truth.py"), str(assets / "yard.blend"), str(when), str(out)]
-    subprocess.run([sys.executable, *script], check=True, capture_output=True)
+    run_python(HERE / "blender_truth.py", assets / "yard.blend", when, out)
     corners = np.load(out)["corners"] * [1, -1, 1]
     mesh = trimesh.Trimesh(
         corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False
@@ -320,9 +312,8 @@ def test_the_command_renders_all_maps_of_the_assets(assets, tmp_path):
     options = ["--size", "32", "--frames", "1", "--scenes", "2", "--seed", "5", "--workers", "1"]
     of_blender = ["--assets", quick / "assets.toml"]
 
-    result = invoke("synth", tmp_path / "out", *options, *of_blender)
+    result = succeed("synth", tmp_path / "out", *options, *of_blender)
 
-    assert result.exit_code == 0, result.output
     markers = (tmp_path / "out").rglob("_scene_complete.json")
     assert {marker.parts[-3] for marker in markers} <= {"Room", "Yard"}
     assert "2 scenes in train/IPD_Gaussian/" in result.stdout
@@ -438,11 +429,9 @@ def test_visible_pixels_agree_when_warped_by_depth(scenes):
 def test_the_doctor_confirms_the_contract_and_the_audit_finds_nothing(rendered):
     few = ("--per-scene", "2", "--workers", "1")
 
-    doctor = invoke("doctor", rendered, *few, "--scenes", "2", "--json")
-    audit = invoke("audit", rendered, *few)
+    doctor = succeed("doctor", rendered, *few, "--scenes", "2", "--json")
+    succeed("audit", rendered, *few)
 
-    assert doctor.exit_code == 0, doctor.output
-    assert audit.exit_code == 0, audit.output
     (verdict,) = json.loads(doctor.stdout)["verdicts"]
     assert len(verdict["scenes"]) == 2
     assert verdict["quotient"] == pytest.approx(1, rel=0.01)
