@@ -40,9 +40,8 @@ def folder_with_scenes(tmp_path_factory):
     return folder
 
 
-def test_the_readme_runs_in_its_own_order_in_one_folder(tmp_path, monkeypatch):
+def test_the_readme_runs_in_its_own_order_in_one_folder(here, monkeypatch):
     """As a person would copy it: commands and Python alike, and nothing warns."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "100")
     ran = 0
     for language, block in re.findall(r"```(\w*)\n(.*?)```", README.read_text(), flags=re.DOTALL):

@@ -123,12 +123,11 @@ def test_the_shipped_descriptor_of_the_sample_loads_every_record_in_both_orders(
     assert records["baselines"] == sample.column("baselines_cm").reshape(-1).tolist()
 
 
-def test_the_shipped_descriptors_are_those_of_make_descriptors(tmp_path, monkeypatch):
-    copied = tmp_path / "croissant"
-    shutil.copytree(HOME / "shards", tmp_path / "shards")
+def test_the_shipped_descriptors_are_those_of_make_descriptors(here):
+    copied = here / "croissant"
+    shutil.copytree(HOME / "shards", here / "shards")
     planned = planned_by_make("descriptors").replace("\\\n", " ")
     commands = re.findall(r"^\S*stereogenbench (publish croissant .*)", planned, re.MULTILINE)
-    monkeypatch.chdir(tmp_path)
 
     for command in commands:
         succeed(*shlex.split(command))

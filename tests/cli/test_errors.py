@@ -115,9 +115,8 @@ def test_control_characters_of_a_name_are_escaped(tmp_path):
         *((words, "the path is empty") for words in ("synth ''", "pack scenes ''", "index ''")),
     ],
 )
-def test_a_wrong_call_is_refused_and_nothing_is_written(words, told, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_wrong_call_is_refused_and_nothing_is_written(words, told, here):
     ended = invoke(*shlex.split(words))
 
     assert (ended.exit_code, told in ended.output) == (2, True)
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []

@@ -8,6 +8,7 @@ import shutil
 import struct
 import sys
 import termios
+from contextlib import suppress
 
 import pytest
 
@@ -30,14 +31,9 @@ def on_a_terminal(*words, columns=100, rows=40):
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
     os.write(terminal, b"\n")
     shown = b""
-    while True:
-        try:
-            read = os.read(terminal, 65536)
-        except OSError:
-            break
-        if not read:
-            break
-        shown += read
+    with suppress(OSError):  # as Linux tells that nothing more will come
+        while read := os.read(terminal, 65536):
+            shown += read
     os.waitpid(child, 0)
     lines = ESCAPES.sub(b"", shown).decode().replace("\r\n", "\n").strip("\n").split("\n")
     assert len(lines) <= LINES

@@ -13,13 +13,12 @@ from tests.cli.command import invoke, refused, succeed
 SCENE = "train/Uniform/SynthStage/scene_000001"
 
 
-def test_the_first_scene_is_drawn_under_its_key(small_shards, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_first_scene_is_drawn_under_its_key(small_shards, here):
     shown = succeed("show", small_shards)
     name = "eval_MapSeenInTrain_Uniform_SynthStage_scene_000000.png"
 
     assert shown.stdout == f"{name}: eval/MapSeenInTrain/Uniform/SynthStage/scene_000000\n"
-    with Image.open(tmp_path / name) as sheet:
+    with Image.open(here / name) as sheet:
         assert sheet.size[0] > 1500
 
 
@@ -51,11 +50,9 @@ def test_a_clip_is_written_by_the_ending_of_its_name(small_shards, tmp_path):
         ([SCENE, "-o", "clip.avi"], "a clip .mp4"),
     ],
 )
-def test_what_cannot_be_shown_is_refused(small_shards, tmp_path, monkeypatch, options, reason):
-    monkeypatch.chdir(tmp_path)
-
+def test_what_cannot_be_shown_is_refused(small_shards, here, options, reason):
     assert reason in refused("show", small_shards, *options)
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []
 
 
 def test_an_index_as_json_is_one_document_and_a_broken_scene_gives_exit_status_1(

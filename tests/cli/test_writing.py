@@ -36,10 +36,7 @@ def files_of_at_most(size):
     ],
     ids=lambda words: words[-1],
 )
-def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
-    small_shards, tmp_path, monkeypatch, words
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_file_that_cannot_be_written_is_named_and_not_left_half(small_shards, here, words):
     pytest.importorskip("matplotlib.backends.backend_agg")  # its font cache is a file, too
     with files_of_at_most(100):
         shown = invoke(words[0], small_shards, *words[1:])
@@ -48,7 +45,7 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     assert shown.exit_code == 2
     assert last.startswith(f"StorageError: {words[-1]}"), last
     assert "(File too large). Choose a place that takes files of this size." in last
-    left = [path.name for path in tmp_path.rglob("*") if path.is_file()]
+    left = [path.name for path in here.rglob("*") if path.is_file()]
     assert left == []
 
 
@@ -62,12 +59,10 @@ def test_a_file_that_cannot_be_written_is_named_and_not_left_half(
     ],
     ids=lambda words: words[-1],
 )
-def test_the_folder_of_a_file_is_made(small_release, tmp_path, monkeypatch, words):
-    monkeypatch.chdir(tmp_path)
-
+def test_the_folder_of_a_file_is_made(small_release, here, words):
     succeed(words[0], small_release, *words[1:])
 
-    assert (tmp_path / words[-1]).stat().st_size > 0
+    assert (here / words[-1]).stat().st_size > 0
 
 
 def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_release, tmp_path):
@@ -160,13 +155,10 @@ def test_a_log_gets_progress_line_by_line_as_time_passes(printed_progress):
         "export clips nowhere out --layout musubi",
     ],
 )
-def test_a_mistyped_place_is_reported_in_one_line_and_makes_no_folder(
-    words, small_shards, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_mistyped_place_is_reported_in_one_line_and_makes_no_folder(words, small_shards, here):
     ended = invoke(*words.replace("SHARDS", str(small_shards)).split())
 
     (line,) = ended.stderr.splitlines()
     assert (ended.exit_code, "nowhere" in line) == (2, True)
     assert " nowhere " not in words or "SHARDS" in words or "nowhere: does not exist" in line
-    assert list(tmp_path.iterdir()) == []
+    assert list(here.iterdir()) == []

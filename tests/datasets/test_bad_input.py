@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -40,31 +41,35 @@ def root_of(scene):
     return scene.parents[3]
 
 
+def edited(change):
+    return lambda path: rewrite_json(path, change)
+
+
 DAMAGES = {
     "a missing camera": (
-        "cam_03_rgb.mp4", None, "is missing, and the scene is marked as complete",
+        "cam_03_rgb.mp4", Path.unlink, "is missing, and the scene is marked as complete",
     ),
-    "an mp4 cut short": ("cam_01_rgb.mp4", 2000, ""),
-    "a text for a video": ("cam_05_rgb.mp4", "not a video", ""),
-    "a text for a trajectory": ("trajectory.json", "{", ""),
-    "a bomb of brackets": ("baseline.json", "[" * 200_000, "nest"),
+    "an mp4 cut short": ("cam_01_rgb.mp4", lambda path: os.truncate(path, 2000), ""),
+    "a text for a video": ("cam_05_rgb.mp4", lambda path: path.write_text("not a video"), ""),
+    "a text for a trajectory": ("trajectory.json", lambda path: path.write_text("{"), ""),
+    "a bomb of brackets": ("baseline.json", lambda path: path.write_text("[" * 200_000), "nest"),
     "a NaN baseline": (
         "baseline.json",
-        lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan")),
+        edited(lambda doc: doc["pairwise_pairs"][3].update(baseline_cm=float("nan"))),
         r"\$\.pairwise_pairs\[3\]\.baseline_cm.*nan",
     ),
     "a trajectory of other frames": (
-        "trajectory.json", lambda doc: doc.update(frames=doc["frames"][:4]),
+        "trajectory.json", edited(lambda doc: doc.update(frames=doc["frames"][:4])),
         "has poses of 4 frames, and the videos have 7",
     ),
     "a pose without a camera": (
-        "trajectory.json", lambda doc: doc["frames"][2]["cameras"].pop(1),
+        "trajectory.json", edited(lambda doc: doc["frames"][2]["cameras"].pop(1)),
         r"\$\.frames\[2\]\.cameras has 5, and the first such has 6",
     ),
     "poses that contradict the baselines": (
         "baseline.json",
-        lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
-                     for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])],
+        edited(lambda doc: [pair.update(baseline_cm=pair["baseline_cm"] * 2)
+                            for pair in doc["pairwise_pairs"] + doc.get("adjacent_pairs", [])]),
         r"cameras \d and \d are .* cm apart, and by the poses",
     ),
 }  # fmt: skip
@@ -73,14 +78,7 @@ DAMAGES = {
 @pytest.mark.parametrize("what", DAMAGES)
 def test_a_damaged_scene_is_refused_when_the_tree_is_opened(scene, what):
     name, damage, found = DAMAGES[what]
-    if damage is None:
-        (scene / name).unlink()
-    elif isinstance(damage, int):
-        os.truncate(scene / name, damage)
-    elif isinstance(damage, str):
-        (scene / name).write_text(damage)
-    else:
-        rewrite_json(scene / name, damage)
+    damage(scene / name)
 
     with pytest.raises(StereoGenBenchError, match=f"(?s){re.escape(name)}.*{found}"):
         StereoPairs(root_of(scene), fields=FIELDS, pairs=NEEDING_ALL_VIDEOS)

@@ -13,6 +13,7 @@ from stereogenbench_data.index.parquet import INDEX_NAME
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.schema.release import rgb_name
 from stereogenbench_data.shards.pack import pack
+from tests.shards.shard_files import flip_byte
 
 SCENE = "train/IPD_Gaussian/SynthStage/scene_000000"
 SHARD = "train-IPD_Gaussian-000000.tar"
@@ -26,11 +27,7 @@ def selected(root, **options):
 def flip(root, pairs, *, place):
     """Flip the lowest bit of a byte of the first view's video, at 0 the first, at 1 the last."""
     member = pairs.index.scene(pairs.plan.locate(0, epoch=0).row).members[rgb_name(0)]
-    with (root / SHARD).open("r+b") as file:
-        file.seek(member.offset + min(int(member.size * place), member.size - 1))
-        byte = file.read(1)[0]
-        file.seek(-1, 1)
-        file.write(bytes([byte ^ 1]))
+    flip_byte(root / SHARD, member.offset + min(int(member.size * place), member.size - 1))
 
 
 def harmless_flip(root):
@@ -78,10 +75,7 @@ def folder(small_release, tmp_path):
     """A copy of a folder, indexed with checksums, in which then a bit was flipped."""
     root = shutil.copytree(small_release, tmp_path / "folder")
     SceneIndex.from_report(walk(root, checksums="all")).write(root / INDEX_NAME)
-    path = root / SCENE / rgb_name(0)
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 1
-    path.write_bytes(content)
+    flip_byte(root / SCENE / rgb_name(0))
     return root
 
 

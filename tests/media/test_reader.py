@@ -22,9 +22,8 @@ def test_a_path_a_string_and_an_open_file_are_read_alike(clips, clip, kind):
     assert clips.shown(file, [40]) == [40]
 
 
-def test_a_name_that_looks_like_an_address_is_a_file_name(clips, clip, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "concat:a|é.mp4").write_bytes(clip.read_bytes())
+def test_a_name_that_looks_like_an_address_is_a_file_name(clips, clip, here):
+    (here / "concat:a|é.mp4").write_bytes(clip.read_bytes())
 
     assert clips.shown("concat:a|é.mp4", [3]) == [3]
 

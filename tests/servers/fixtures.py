@@ -73,6 +73,13 @@ def large_shards(large_release: Path, once: Once) -> Path:
 
 
 @pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty folder, in which a test runs."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
 def web(tmp_path: Path) -> Iterator[FailingServer]:
     """A web server that serves ``tmp_path / "web"``, counts, and fails as it is told."""
     folder = tmp_path / "web"

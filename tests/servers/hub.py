@@ -114,24 +114,24 @@ class HubHandler(FileHandler):
         path: Path = self.server.folder / name
         facts = self.server.facts
         facts.setdefault("resolved", []).append((revision, name, dict(self.headers.items())))
-        if refusal := next(iter(facts.get("refusals", ())), None):
-            facts["refusals"].pop(0)
-            self._empty(refusal[0], name, refusal[1])
-            return
-        if revision not in _REVISIONS:
+        if facts.get("refusals"):
+            status, headers = facts["refusals"].pop(0)
+            self._empty(status, name, headers)
+        elif revision not in _REVISIONS:
             self._refuse(404, "RevisionNotFound")
-            return
-        if not path.is_file():
+        elif not path.is_file():
             self._refuse(404, "EntryNotFound")
-            return
-        if facts.get("gated") and "Authorization" not in self.headers:
+        elif facts.get("gated") and "Authorization" not in self.headers:
             self._refuse(403, "GatedRepo")
-            return
-        if name in facts.get("in_git", ()):
+        elif name in facts.get("in_git", ()):
             headers = {"ETag": '"git"', "X-Repo-Commit": COMMIT}
             self.send_head(200, headers, length=path.stat().st_size)
             self.wfile.write(path.read_bytes())
-            return
+        else:
+            self._sign(name, path, facts)
+
+    def _sign(self, name: str, path: Path, facts: dict[str, Any]) -> None:
+        """Redirect to the signed URL of a file."""
         signature, signed_for_s = f"secret{next(_numbers)}", facts.get("signed_for_s", 3600)
         facts.setdefault("signatures", {})[signature] = time.time() + signed_for_s
         now = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")

@@ -54,11 +54,10 @@ def test_a_camera_that_was_not_fetched_is_named(shards_on_the_web, tmp_path):
         StereoPairs(tmp_path / "part", pairs=[(2, 3)], fields=("left", "right"))
 
 
-def test_a_part_can_be_indexed_packed_shown_and_audited(shards_on_the_web, tmp_path, monkeypatch):
-    part = tmp_path / "part"
+def test_a_part_can_be_indexed_packed_shown_and_audited(shards_on_the_web, here):
+    part = here / "part"
     fetched(shards_on_the_web, part)
     (part / "index.parquet").unlink()
-    monkeypatch.chdir(tmp_path)
 
     for command in (
         ["index", part], ["pack", part, "shards"], ["show", part, "-o", "sheet.png"],
