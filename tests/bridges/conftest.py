@@ -23,6 +23,17 @@ def derived_shards(small_release, once):
     )
 
 
+def require_frames_of_epochs(samples, decoder):
+    """Require that samples are of the frames of the epoch that is set, also when set again."""
+
+    def drawn(epoch):
+        decoder.set_epoch(epoch)
+        return [int(sample["frame_index"]) for sample in samples]
+
+    first, second, again = drawn(0), drawn(1), drawn(0)
+    assert first == again != second
+
+
 def require_equal(one, other):
     """Require the same fields, dtypes and values of two samples, of arrays or of tensors."""
     assert one.keys() == other.keys()

@@ -1,8 +1,6 @@
 """Samples that cost nothing to load: their keys, which tell them all apart."""
 
 import itertools
-import os
-import signal
 import subprocess
 
 import imageio_ffmpeg
@@ -14,6 +12,7 @@ from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.media import depth
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
+from tests.servers.tools import fork_and as fork_and
 
 
 @pytest.fixture(scope="session")
@@ -77,21 +76,6 @@ def in_turn(shares):
     """Return the batches of all ranks in the order of the training steps."""
     rows = itertools.zip_longest(*shares)
     return [batch for row in rows for batch in row if batch is not None]
-
-
-def fork_and(act):
-    """Run a function in a fork of this process, which then ends; return its exit status."""
-    child = os.fork()
-    if child == 0:
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
-        signal.alarm(60)  # ends a fork that hangs
-        status = 1
-        try:
-            act()
-            status = 0
-        finally:
-            os._exit(status)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
 def ffmpeg(*arguments):

@@ -122,16 +122,24 @@ def planned_by_make(target: str) -> str:
     return done.stdout
 
 
-def killed_fork(act: Callable[[], object]) -> bool:
-    """Run a function in a fork of this process; return whether it was killed while it ran."""
+def fork_and(act: Callable[[], object]) -> int:
+    """Run a function in a fork of this process, which then ends; return its exit status."""
     child = os.fork()
     if child == 0:
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.alarm(60)  # ends a fork that hangs
+        status = 1
         try:
             act()
+            status = 0
         finally:
-            os._exit(1)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def killed_fork(act: Callable[[], object]) -> bool:
+    """Run a function in a fork of this process; return whether it was killed while it ran."""
+    return fork_and(act) == -signal.SIGKILL
 
 
 def kill_at(most: int) -> Callable[[int, int], None]:
