@@ -1,15 +1,17 @@
 """The page in a real browser: what it shows is what the data say, by mouse and by keyboard."""
 
-import dataclasses
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
+from stereogenbench_data.schema.parse import parse_scene_key
 from tests.audit.browsing import run, serving
 from tests.audit.corruption import rewrite_depth
 from tests.servers.tools import chromium, require_module, wait_until
+from tests.shards.shard_files import scenes_of
 
 # The index names a scene that was left out, each time that it is opened.
 pytestmark = pytest.mark.filterwarnings(
@@ -36,16 +38,14 @@ def data(small_release, tmp_path_factory):
     root = tmp_path_factory.mktemp("many") / "data"
     shutil.copytree(small_release, root)
     rewrite_depth(root / "train/Uniform/SynthStage/scene_000001", unmeasured_corner)
-    index = SceneIndex.open(root)
     scenes = []
-    for row in range(len(index)):
-        scene = index.scene(row)
+    for row, scene in enumerate(scenes_of(root).values()):
         for copy in range(COPIES):
             key = f"{scene.id.key.rpartition('/')[0]}/scene_{row * COPIES + copy:06d}"
-            scenes.append(dataclasses.replace(scene, id=dataclasses.replace(scene.id, key=key)))
-    lost = dataclasses.replace(scenes[-1].members["cam_01_depth.mkv"], path="lost.mkv")
+            scenes.append(replace(scene, id=parse_scene_key(key)))
+    lost = replace(scenes[-1].members["cam_01_depth.mkv"], path="lost.mkv")
     members = dict(scenes[-1].members) | {"cam_01_depth.mkv": lost}
-    scenes[-1] = dataclasses.replace(scenes[-1], members=members)
+    scenes[-1] = replace(scenes[-1], members=members)
     many = SceneIndex.from_scenes(scenes, root)
     many.broken = {"train/Uniform/SynthStage/scene_000999": "cam_00_rgb.mp4: has 6 frames"}
     many.write(root / "index.parquet")

@@ -6,6 +6,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, SelectionError
 from stereogenbench_data.audit.browser.catalogue import Catalogue, parse_choice
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import BASELINE_BINS, CAMERA_PAIRS, baseline_bin
 from tests.audit.browsing import run
 
@@ -74,18 +75,15 @@ def test_a_scenes_pairs_go_from_the_narrowest_to_the_widest(catalogue, index):
 
 def test_a_long_list_comes_in_parts(index):
     scene = dataclasses.replace(index.scene(0), members={})
-    scenes = [
-        dataclasses.replace(
-            scene, id=dataclasses.replace(scene.id, key=f"train/scene_{number:06d}")
-        )
-        for number in range(450)
-    ]
+    folder = "train/Uniform/Town"
+    ids = [parse_scene_key(f"{folder}/scene_{number:06d}") for number in range(450)]
+    scenes = [dataclasses.replace(scene, id=each) for each in ids]
     catalogue = Catalogue(SceneIndex.from_scenes(scenes, index.root), shown_data="x")
     listed = catalogue.listed({}, first=400, count=10_000)
 
     assert (listed["total"], listed["first"], len(listed["rows"])) == (450, 400, 50)
     assert len(catalogue.listed({}, first=0, count=10_000)["rows"]) == 200
-    assert catalogue.place({}, "train/scene_000321") == 321
+    assert catalogue.place({}, f"{folder}/scene_000321") == 321
 
 
 def test_a_bin_that_is_none_leaves_nothing_and_says_why(catalogue):

@@ -9,6 +9,7 @@ import pytest
 from stereogenbench_data import SceneIndex
 from stereogenbench_data.audit.statistics import compared, statistics, statistics_markdown
 from stereogenbench_data.errors import SelectionError
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 from tests.audit.release_counts import paper_scenes
 from tests.cli.command import succeed
@@ -41,8 +42,7 @@ def three(indexed_release):
         key = f"train/Uniform/Car_Dealer/scene_{number:06d}"
         return dataclasses.replace(
             scene,
-            id=dataclasses.replace(scene.id, key=key, split="train", subset=None,
-                                   family="Uniform", map_name="Car_Dealer"),
+            id=parse_scene_key(key),
             rig=dataclasses.replace(scene.rig, baselines_cm=baselines, focal_mm=focal_mm,
                                     primary_pair=(1, 2)),
         )  # fmt: skip
@@ -79,8 +79,7 @@ def test_baselines_bins_and_focal_lengths_of_three_scenes(three):
 
 def test_a_map_of_train_in_a_scene_of_unseen_map_is_a_finding(three):
     scenes = [three.scene(row) for row in range(3)]
-    place = dataclasses.replace(scenes[2].id, key="eval/MapUnseenInTrain/Uniform/Car_Dealer/s_3",
-                                split="eval", subset="unseen_map")  # fmt: skip
+    place = parse_scene_key("eval/MapUnseenInTrain/Uniform/Car_Dealer/s_3")
     index = SceneIndex.from_scenes([*scenes[:2], dataclasses.replace(scenes[2], id=place)], "x")
 
     (finding,) = statistics(index).findings

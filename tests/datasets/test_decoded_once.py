@@ -8,6 +8,7 @@ import pytest
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.datasets import workers as processes
+from stereogenbench_data.schema.parse import parse_scene_key
 from tests.datasets.conftest import keys_of
 from tests.servers.tools import open_files
 
@@ -24,7 +25,7 @@ def of_real_size(small_release):
     two, scenes = [drawn.indexed_scene(row) for row in range(2)], []
     for number in range(SCENES):
         key = f"{two[number % 2].id.key.rpartition('/')[0]}/scene_{number:06d}"
-        scenes.append(replace(two[number % 2], id=replace(two[number % 2].id, key=key)))
+        scenes.append(replace(two[number % 2], id=parse_scene_key(key)))
     return SceneIndex.from_scenes(scenes, small_release)
 
 

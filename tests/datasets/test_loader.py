@@ -22,6 +22,7 @@ from stereogenbench_data.datasets.division import (
     OpenVideosWarning,
     RepeatedDecodingWarning,
 )
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.selection.order import OrderRule
 from tests.datasets.conftest import flat, in_turn, keys_of
 
@@ -346,15 +347,11 @@ def test_workers_who_have_nothing_to_do_are_warned_of(small_index):
 def test_scenes_of_large_pictures_are_interleaved_in_smaller_numbers(
     small_index, side_px, selection, expected, shuffle_groups, frames_of_32
 ):
-    scenes = [small_index.scene(number % 4) for number in range(100)]
-    scenes = [
-        replace(
-            scene,
-            id=replace(scene.id, key=f"{scene.id.key}{number}"),
-            rig=replace(scene.rig, image_width_px=side_px, image_height_px=side_px),
-        )
-        for number, scene in enumerate(scenes)
-    ]
+    scenes = []
+    for number in range(100):
+        scene = small_index.scene(number % 4)
+        rig = replace(scene.rig, image_width_px=side_px, image_height_px=side_px)
+        scenes.append(replace(scene, id=parse_scene_key(f"{scene.id.key}{number}"), rig=rig))
     index = SceneIndex.from_scenes(scenes, small_index.root)
     options = {"frames": "all", "fields": ("__key__",), **selection}
     pairs = StereoPairs(index, **options)

@@ -17,6 +17,7 @@ from stereogenbench_data.synthesis.request import SynthRequest
 
 FRAMES = 4
 SIZE = (48, 64)
+QUICK = EvaluationProtocol(metrics=("psnr",), size=SIZE)
 
 
 @pytest.fixture(scope="session")

@@ -17,7 +17,7 @@ from stereogenbench_data.evaluation.protocol import PROTOCOL_VERSION
 from stereogenbench_data.evaluation.report import markdown
 from stereogenbench_data.evaluation.tables import cell, table_of
 from stereogenbench_data.schema.release import CAMERA_PAIRS
-from tests.evaluation.conftest import SIZE, numbers, scored
+from tests.evaluation.conftest import QUICK, numbers, scored
 
 TARGET, COPIED, WRONG, RANDOM = range(4)
 """The controls in the order in which they are scored."""
@@ -152,11 +152,9 @@ def test_the_wrong_baseline_is_camera_02(scored_index, other_views, protocol):
 
 
 def test_a_random_right_depends_on_the_seed_alone(scored_index, tmp_path):
-    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
-
     def random_right(seed, **options):
         options = {"frames": "first", "workers": 1} | options
-        return numbers(score_controls(scored_index, protocol=protocol, seed=seed, **options)[3])
+        return numbers(score_controls(scored_index, protocol=QUICK, seed=seed, **options)[3])
 
     assert random_right(0) == random_right(0, out=tmp_path)
     assert len({str(random_right(seed)) for seed in range(4)}) == 2

@@ -5,6 +5,7 @@ import math
 import os
 import shutil
 import signal
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import ClassVar
@@ -24,6 +25,7 @@ from stereogenbench_data.evaluation.predictions import frame_name, item_name
 from stereogenbench_data.schema.release import rgb_name
 from tests.evaluation.conftest import (
     FRAMES,
+    QUICK,
     SIZE,
     numbers,
     rendered,
@@ -296,7 +298,7 @@ class Counting(ProcessPool):
 def test_models_on_a_gpu_are_loaded_by_one_process_unless_more_are_asked_for(
     scored_index, right_views, device, workers, asked
 ):
-    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE, device=device)
+    protocol = replace(QUICK, device=device)
 
     scored(scored_index, right_views, protocol, frames=[0], workers=workers, engine=Counting())
 
@@ -306,11 +308,11 @@ def test_models_on_a_gpu_are_loaded_by_one_process_unless_more_are_asked_for(
 def test_results_of_another_evaluation_are_refused_by_what_differs(
     scored_index, right_views, tmp_path
 ):
-    options = {"protocol": EvaluationProtocol(metrics=("psnr",), size=SIZE), "frames": [0]}
+    options = {"protocol": QUICK, "frames": [0]}
     scored(scored_index, right_views, **options, out=tmp_path)
 
     for change, differs in (
-        ({"protocol": EvaluationProtocol(metrics=("psnr",), size=(32, 64))}, r"settings\.size"),
+        ({"protocol": replace(QUICK, size=(32, 64))}, r"settings\.size"),
         ({"tier": "G2"}, "tier: 'G1', where 'G2'"),
         ({"frames": [0, 1]}, "frames"),
         ({"name": "another"}, "methods"),
@@ -468,9 +470,8 @@ def test_baselines_that_poses_contradict_are_not_scored_by_any_metric(
 
     rewrite(folder / "trajectory.json", move)
 
-    protocol = EvaluationProtocol(metrics=("psnr",), size=SIZE)
     with pytest.raises(StorageError, match=r"baseline_m.* cm apart"):
-        scored(tmp_path / "tree", right_views, protocol, tier="G2")
+        scored(tmp_path / "tree", right_views, QUICK, tier="G2")
 
 
 def test_conventions_are_taken_where_a_folder_is_opened(

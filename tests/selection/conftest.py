@@ -7,22 +7,16 @@ import numpy as np
 import pytest
 
 from stereogenbench_data.index.table import SceneIndex
-from stereogenbench_data.schema.records import Rig, Scene, SceneId, SceneLabels
+from stereogenbench_data.schema.parse import parse_scene_key
+from stereogenbench_data.schema.records import Rig, Scene, SceneLabels
 from stereogenbench_data.schema.release import CAMERA_PAIRS
 
 
 def made_scene(key, *, gaps_cm=(6.0,) * 5, frames=81, primary=(0, 1), **labels):
     """Return a scene record whose cameras stand gaps_cm apart."""
-    split, *subset, family, map_name, _ = key.split("/")
     places = np.concatenate([[0], np.cumsum(gaps_cm)])
     return Scene(
-        id=SceneId(
-            key=key,
-            split=split,
-            subset={"MapSeenInTrain": "seen_map"}.get(subset[0], "unseen_map") if subset else None,
-            family=family,
-            map_name=map_name,
-        ),
+        id=parse_scene_key(key),
         labels=SceneLabels(character=labels.get("character"), animation=labels.get("animation")),
         caption=labels.get("caption", ""),
         rig=Rig(

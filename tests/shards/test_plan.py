@@ -6,6 +6,7 @@ import pytest
 
 from stereogenbench_data.errors import ShardError
 from stereogenbench_data.index.table import SceneIndex
+from stereogenbench_data.schema.parse import parse_scene_key
 from stereogenbench_data.schema.records import Member
 from stereogenbench_data.shards.plan import MEMBER_ORDER, parse_bytes, plan_shards, planned_members
 
@@ -22,14 +23,8 @@ def index_of(pattern):
     def make(sizes, **places):
         scenes = []
         for key, size in sizes.items():
-            family, map_name = key.split("/")[-3:-1]
-            split = key.split("/")[0]
-            subset = "unseen_map" if split == "eval" else None
-            place = replace(
-                pattern.id, key=key, family=family, map_name=map_name, split=split, subset=subset
-            )
             members = {"baseline.json": Member(f"{key}/baseline.json", 0, size)}
-            scenes.append(replace(pattern, id=place, members=members))
+            scenes.append(replace(pattern, id=parse_scene_key(key), members=members))
         return SceneIndex.from_scenes(scenes, places.pop("root", "/release"), **places)
 
     return make
