@@ -147,7 +147,7 @@ def test_many_threads_get_each_their_own_frame(server, indexed_release):
     wanted = {}
     pairs = StereoPairs(indexed_release, scenes=SCENE, pairs=[(0, 3), (2, 4)], frames="all",
                         fields=("disparity", "valid", "pair", "frame_index"))  # fmt: skip
-    for sample in (pairs[number] for number in range(len(pairs))):
+    for sample in pairs:
         left, right = sample["pair"].tolist()
         measured = sample["disparity"].where(sample["valid"], float("nan")).numpy()
         wanted[left, right, int(sample["frame_index"])] = measured.tobytes()

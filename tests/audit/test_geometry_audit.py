@@ -315,6 +315,7 @@ def test_one_frame_tells_nothing_of_motion(indexed_release):
     assert not {"depth consistency", "picture content"} & untested
 
 
+@pytest.mark.filterwarnings("error")
 def test_scenes_that_cannot_be_indexed_are_findings_or_notes(indexed_release, tmp_path):
     cut = copied(indexed_release / SCENE, tmp_path) / "cam_02_rgb.mp4"
     cut.write_bytes(cut.read_bytes()[:-500])
@@ -322,7 +323,7 @@ def test_scenes_that_cannot_be_indexed_are_findings_or_notes(indexed_release, tm
         path.unlink()
     copied(indexed_release / "train/IPD_Gaussian/SynthStage/scene_000000", tmp_path)
 
-    report = audit(tmp_path, workers=1)  # without a warning
+    report = audit(tmp_path, workers=1)
     of_family = audit(tmp_path, workers=1, family="IPD_Gaussian")
     of_scene = audit(tmp_path, workers=1, scenes=SCENE)
 

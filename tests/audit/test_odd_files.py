@@ -149,8 +149,7 @@ def as_six_numbers(document):
 def all_poses(root, **how):
     fields = ("right_from_left", "world_from_left")
     pairs = StereoPairs(root, fields=fields, frames="all", pairs="all", **how)
-    samples = (pairs[number] for number in range(len(pairs)))
-    return torch.stack([sample[field] for sample in samples for field in fields])
+    return torch.stack([sample[field] for sample in pairs for field in fields])
 
 
 OF_SIX_NUMBERS = """

@@ -18,6 +18,7 @@ from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.media.encoder import Encoding
 from stereogenbench_data.schema.records import DepthEncoding
 from tests.servers.tools import files_of, kill_at, killed_fork, small_disk
+from tests.shards.shard_files import scenes_of
 
 FIELDS = ("left", "right", "warped_right", "hole", "baseline_m", "frame_rate_hz", "caption",
           "scene", "split", "pair")  # fmt: skip
@@ -119,10 +120,9 @@ def test_a_caption_is_one_line_of_text_for_every_trainer(indexed_release, tmp_pa
 
 def changed_scenes(root, **values):
     """Return an index whose scenes have other values of some attributes, in the index's order."""
-    index = SceneIndex.open(root)
     scenes = [
-        replace(index.scene(row), **{name: each[row] for name, each in values.items()})
-        for row in range(len(index))
+        replace(scene, **{name: each[row] for name, each in values.items()})
+        for row, scene in enumerate(scenes_of(root).values())
     ]
     return SceneIndex.from_scenes(scenes, root)
 

@@ -12,6 +12,7 @@ from stereogenbench_data.bridges.generation import GenStereo, StereoClips
 from stereogenbench_data.index.table import SceneIndex
 from stereogenbench_data.samples.fields import OddSceneWarning
 from tests.servers.tools import require_module
+from tests.shards.shard_files import scenes_of
 
 FIELDS = ("left", "right", "disparity", "valid", "warped_right", "hole")
 
@@ -56,9 +57,8 @@ def test_the_warped_view_and_the_mask_are_the_fields(detailed_release, transform
 
 
 def test_genstereo_refuses_rigs_that_are_not_rectified_by_name(detailed_release):
-    index = SceneIndex.open(detailed_release)
-    scenes = [replace(index.scene(row), rig_residual_px=3.5) for row in range(len(index))]
-    turned = SceneIndex.from_scenes(scenes, index.root)
+    (scene,) = scenes_of(detailed_release).values()
+    turned = SceneIndex.from_scenes([replace(scene, rig_residual_px=3.5)], detailed_release)
 
     with pytest.warns(OddSceneWarning), pytest.raises(SelectionError, match=r"off by 3\.5 px"):
         GenStereo(turned)

@@ -14,17 +14,15 @@ REQUIRED = (
     "prov:wasGeneratedBy",
 )  # fmt: skip
 """Properties that a dataset must state and mlcroissant does not ask for."""
-RAI_NAMES = frozenset(
-    {
-        "dataCollection", "dataCollectionMissingData", "dataCollectionRawData",
-        "dataCollectionTimeframe", "dataCollectionType", "dataImputationProtocol",
-        "dataManipulationProtocol", "dataPreprocessingProtocol", "dataAnnotationProtocol",
-        "dataAnnotationPlatform", "dataAnnotationAnalysis", "annotationsPerItem",
-        "annotatorDemographics", "machineAnnotationTools", "dataBiases", "dataUseCases",
-        "dataLimitations", "dataSocialImpact", "personalSensitiveInformation",
-        "dataReleaseMaintenancePlan", "hasSyntheticData",
-    }
-)  # fmt: skip
+RAI_NAMES = {
+    "dataCollection", "dataCollectionMissingData", "dataCollectionRawData",
+    "dataCollectionTimeframe", "dataCollectionType", "dataImputationProtocol",
+    "dataManipulationProtocol", "dataPreprocessingProtocol", "dataAnnotationProtocol",
+    "dataAnnotationPlatform", "dataAnnotationAnalysis", "annotationsPerItem",
+    "annotatorDemographics", "machineAnnotationTools", "dataBiases", "dataUseCases",
+    "dataLimitations", "dataSocialImpact", "personalSensitiveInformation",
+    "dataReleaseMaintenancePlan", "hasSyntheticData",
+}  # fmt: skip
 """The properties of the RAI 1.0 specification, and hasSyntheticData."""
 
 

@@ -80,7 +80,11 @@ def test_conventions_that_cannot_be_written_leave_those_that_were_there(small_re
     assert "--out: --check tests a file and writes none: leave it out." in told
 
 
-@pytest.mark.parametrize(("form", "printed"), [((), "# Statistics of"), (("--json",), '"root": ')])
+@pytest.mark.parametrize(
+    ("form", "printed"),
+    [((), "# Statistics of"), (("--json",), '"root": ')],
+    ids=["as a text", "as JSON"],
+)
 def test_a_report_is_printed_where_its_file_cannot_be_written(
     small_shards, tmp_path, form, printed
 ):

@@ -4,13 +4,12 @@ import shutil
 from collections import defaultdict
 
 import pytest
-import torch
 
 from stereogenbench_data import SceneIndex, StereoPairs
 from stereogenbench_data.selection import plan
 from stereogenbench_data.synthesis.produce import synthesise
 from stereogenbench_data.synthesis.request import SynthRequest
-from tests.datasets.conftest import write_again
+from tests.datasets.conftest import same, write_again
 
 FRAMES = 20
 KEY_FRAMES = (0, 8, 16)
@@ -49,7 +48,7 @@ def keyed_release(whole, once):
 def epoch_of(loader):
     """Return the samples of a pass by key."""
     return {
-        key: {name: batch[name][place] for name in ("left", "right", "disparity")}
+        key: {name: values[place] for name, values in batch.items()}
         for batch in loader
         for place, key in enumerate(batch["__key__"])
     }
@@ -75,10 +74,7 @@ def test_runs_are_shuffled_by_themselves_and_hold_the_right_frames(whole, keyed_
 
     assert len(loader.batches.dataset.plan.runs.pairs) == 6 - 2  # 16 to 19 belongs to the run of 8
     assert len(found) == 2 * FRAMES
-    for number in range(len(expected)):
-        sample = expected[number]
-        for name, value in found[sample["__key__"]].items():
-            assert torch.equal(value, sample[name]), name
+    assert all(same(found[sample["__key__"]], sample) for sample in expected)
 
 
 def test_a_run_begins_decoding_at_its_key_frame(keyed_release, read):
@@ -112,10 +108,8 @@ def test_every_sample_comes_once_and_as_by_number(keyed_release, selection, work
     found = epoch_of(loader)
 
     assert len(found) == len(pairs)
-    for number in range(0, len(pairs), 7):
-        sample = pairs[number]
-        assert torch.equal(found[sample["__key__"]]["right"], sample["right"])
-        assert torch.equal(found[sample["__key__"]]["disparity"], sample["disparity"])
+    samples = [pairs[number] for number in range(0, len(pairs), 7)]
+    assert all(same(found[sample["__key__"]], sample) for sample in samples)
 
 
 def test_frames_drawn_at_random_are_dealt_to_as_many_runs(keyed_release):

@@ -125,12 +125,13 @@ def test_passes_that_repeat_an_epoch_are_warned_of_once(
     assert told.read_text().count("RepeatedEpochWarning") == (0 if sets_epochs else 1)
 
 
+@pytest.mark.filterwarnings("error:a new loader repeats epoch")
 def test_equal_passes_are_no_matter_where_nothing_is_random(small_index):
     crop = Crop(0, 0, 32, 32)
     for transform in (None, crop, Compose([crop, Compose([Resize(16, 16)])])):
         pairs = StereoPairs(small_index, fields=("__key__",), transform=transform)
         loader = DataLoader(pairs, batch_size=2)
-        assert keys_of(loader) == keys_of(loader)  # without a warning
+        assert keys_of(loader) == keys_of(loader)
 
 
 @pytest.mark.parametrize("ordered_by", ["torch", "EpochBatches"])
@@ -184,7 +185,11 @@ def test_a_forked_rank_has_an_epoch_of_its_own_which_its_workers_share(small_ind
     assert pairs.epoch == 1
 
 
-@pytest.mark.parametrize("mode", [torch.inference_mode, partial(torch.device, "meta")], ids=str)
+@pytest.mark.parametrize(
+    "mode",
+    [torch.inference_mode, partial(torch.device, "meta")],
+    ids=["inference", "default device"],
+)
 def test_a_dataset_is_made_in_any_mode_of_torch(small_index, mode):
     with mode():
         pairs = StereoPairs(small_index, fields=("__key__",))

@@ -12,6 +12,7 @@ from stereogenbench_data.evaluation.inputs import export_inputs
 from stereogenbench_data.evaluation.predictions import item_name
 from tests.evaluation.conftest import FRAMES, SIZE
 from tests.servers.tools import files_of
+from tests.shards.shard_files import scenes_of
 
 
 def export(index, out, tier, **options):
@@ -61,8 +62,7 @@ def test_g2_leaks_nothing_by_name_or_by_content(scored_index, exported):
     told = json.loads(everything["inputs.json"])
     forbidden = {b"baseline", b"depth", b"disparity", b"right", b"intrinsic", b"focal"}
     numbers = []
-    for row in range(len(scored_index)):
-        scene = scored_index.scene(row)
+    for scene in scenes_of(scored_index.root).values():
         forbidden |= {scene.id.key.encode(), scene.id.family.encode(), scene.id.map_name.encode()}
         numbers += [*scene.rig.baselines_cm, scene.rig.focal_mm]
     forbidden |= {f"{number:.6g}".encode() for number in numbers}

@@ -108,16 +108,14 @@ def test_all_but_pictures_is_bit_for_bit_what_size_gives(release, packed):
 
 
 def test_pictures_have_the_psnr_that_the_index_states(release, packed):
-    index = SceneIndex.open(packed)
     derived = StereoPairs(packed, pairs=[(1, 4)], frames="all", fields=("left", "scene"))
     on_the_fly = StereoPairs(release, pairs=[(1, 4)], frames="all", fields=("left",), size=SIZE)
     found = {}
-    for number in range(len(derived)):
-        one, other = derived[number], on_the_fly[number]
+    for one, other in zip(derived, on_the_fly, strict=True):
         found.setdefault(one["scene"], []).append(psnr_db(one, other))
 
-    for scene in map(index.scene, range(len(index))):
-        decibels = found[scene.id.key]
+    for key, scene in scenes_of(packed).items():
+        decibels = found[key]
         assert scene.training.psnr_db[1] == pytest.approx(np.mean(decibels), abs=0.0011)
         assert scene.training.worst_psnr_db[1] == pytest.approx(min(decibels), abs=0.0011)
         assert scene.training.psnr_db[1] <= np.mean(decibels)
@@ -393,13 +391,12 @@ def test_what_needs_released_pictures_refuses_derived_ones(packed, tmp_path, wor
 def test_unpacked_training_shards_are_a_folder_of_derived_scenes(packed, tmp_path):
     unpack(packed, tmp_path)
     (tmp_path / "index.parquet").unlink(missing_ok=True)
-    folder, index = SceneIndex.open(tmp_path), SceneIndex.open(packed)
+    folder, shards = scenes_of(tmp_path), scenes_of(packed)
 
-    for row in range(len(index)):
-        one, other = folder.scene(row), index.scene(row)
+    for key, scene in folder.items():
         for name in ("training", "rig", "key_frames", "rig_residual_px"):
-            assert repr(getattr(one, name)) == repr(getattr(other, name))
-    one, other = (StereoPairs(each, fields=("disparity",))[1] for each in (folder, packed))
+            assert repr(getattr(scene, name)) == repr(getattr(shards[key], name))
+    one, other = (StereoPairs(each, fields=("disparity",))[1] for each in (tmp_path, packed))
     assert torch.equal(one["disparity"], other["disparity"])
 
 
