@@ -4,6 +4,7 @@ import os
 import resource
 import signal
 import stat
+import sys
 from contextlib import contextmanager
 
 import pytest
@@ -19,11 +20,13 @@ def files_of_at_most(size):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    sys.dont_write_bytecode, usual = True, sys.dont_write_bytecode  # of modules, cut for good
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
+        sys.dont_write_bytecode = usual
 
 
 @pytest.mark.parametrize(

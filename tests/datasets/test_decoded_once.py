@@ -129,6 +129,6 @@ def test_many_datasets_hold_few_files_open(small_index):
     before = len(open_files())
     many = [StereoPairs(small_index) for _ in range(200)]
 
-    assert len(open_files()) <= before + 1
+    assert len(open_files()) <= before + 2  # one block of memory for many of them
     many[7].set_epoch(3)
     assert [many[6].epoch, many[7].epoch, first.epoch] == [0, 3, 0]
