@@ -320,7 +320,11 @@ def _missing(
 ) -> SchemaError:
     """Return the error of a step that leads nowhere."""
     path = path_of(document, steps[:-1], at, lengths)
-    wanted = _written(steps[-1:]).removeprefix(".")
+    step = steps[-1]
+    if isinstance(step, Entries):
+        wanted = f"{{{step.text}}}"
+    else:
+        wanted = "[]" if isinstance(step, Every) else child_path("", step).removeprefix(".")
     return SchemaError(f"{where}: {path} has no {wanted}; it is {brief(node)}")
 
 
@@ -337,16 +341,3 @@ def path_of(document: Any, steps: Sequence[Step], at: int, lengths: Sequence[int
         key, node = children[places.pop(0)] if is_axis else children[0]
         path = child_path(path, key)
     return path
-
-
-def _written(steps: Sequence[Step]) -> str:
-    """Return steps as they are written."""
-    text = ""
-    for step in steps:
-        if isinstance(step, Every):
-            text += "[]"
-        elif isinstance(step, Entries):
-            text += f".{{{step.text}}}" if text and text[-1] not in "]" else f"{{{step.text}}}"
-        else:
-            text = child_path(text, step)
-    return text
