@@ -156,6 +156,21 @@ def _numbers(
 ) -> Float64[np.ndarray, "..."]:
     """Return the numbers at a place, by its axes, and then by the lists that stand there."""
     leaves, lengths = leaves_at(document, place, where=where, way=way)
+
+    def unreadable(odd: int) -> SchemaError:
+        """Return the error of a value that is no number, or no list like the others."""
+        pose = odd // math.prod(shape[len(lengths) :])
+        path = path_of(document, (*place.steps, *way), pose, lengths)
+        of_pose = ""
+        if len(lengths) == 2:
+            frame, camera = divmod(pose, lengths[1])
+            frame, camera = (camera, frame) if at.outer == "cameras" else (frame, camera)
+            of_pose = f"frame {frame}, camera {camera}: "
+        return SchemaError(
+            f"{where}: {of_pose}{path} must be a number, or as many as in the first pose, found "
+            f"{brief(leaves[odd])}"
+        )
+
     if place.tail in ("slice", "text"):
         taken = (at_end(leaf, place) for leaf in leaves)  # a list, or nothing
         leaves = [each if type(each) is list else leaf
@@ -166,8 +181,7 @@ def _numbers(
         odd = next((n for n, leaf in enumerate(leaves)
                     if type(leaf) is not list or len(leaf) != count), None)  # fmt: skip
         if odd is not None:
-            raise _unreadable(document, (*place.steps, *way), at, leaves[odd], odd, shape, lengths,
-                              where)  # fmt: skip
+            raise unreadable(odd)
         shape.append(count)
         leaves = [each for leaf in leaves for each in leaf]
     if len(leaves) > _MOST_VALUES:
@@ -178,31 +192,8 @@ def _numbers(
     values = np.array(leaves if are_plain else [math.nan], dtype=np.float64)
     if not np.isfinite(values).all():
         odd = next(n for n, each in enumerate(leaves) if not is_number(each))
-        raise _unreadable(document, (*place.steps, *way), at, leaves[odd], odd, shape, lengths,
-                          where)  # fmt: skip
+        raise unreadable(odd)
     return values.reshape(shape)
-
-
-def _unreadable(  # noqa: PLR0913 - each tells a part of the place
-    document: dict[str, Any],
-    steps: Sequence[Step],
-    at: PosesAt,
-    value: Any,
-    odd: int,
-    shape: Sequence[int],
-    lengths: Sequence[int],
-    where: str,
-) -> SchemaError:
-    """Return the error of a value that is no number, or no list like the others."""
-    inner = math.prod(shape[len(lengths) :])
-    path = path_of(document, steps, odd // inner, lengths)
-    told = f"{where}: {path}: must be a number, or as many as in the first pose, found "
-    places = np.unravel_index(odd // inner, lengths) if lengths else ()
-    if len(places) == 2:
-        frame, camera = places if at.outer != "cameras" else places[::-1]
-        told = f"{where}: frame {frame}, camera {camera}: {path} must be a number, or as many as "
-        told += "in the first pose, found "
-    return SchemaError(f"{told}{brief(value)}")
 
 
 def _ordered(
