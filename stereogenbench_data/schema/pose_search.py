@@ -252,14 +252,10 @@ def _numbered(text: str, axes: tuple[_Axis, ...]) -> Iterator[PosesAt]:
     sizes = len(outer.elements), len(inner.elements)
     if CAMERA_COUNT not in sizes:
         return
-    of_cameras = ["cam" in axis.owner or "view" in axis.owner for axis in axes]
-    is_outer = sizes[0] == CAMERA_COUNT and (sizes[1] != CAMERA_COUNT or of_cameras[0])
-    if sizes[0] == sizes[1] and of_cameras[0] != of_cameras[1]:
-        is_outer = of_cameras[0]
+    is_named = "cam" in outer.owner or "view" in outer.owner
+    is_outer = sizes[0] == CAMERA_COUNT and (sizes[1] != CAMERA_COUNT or is_named)
     cameras, frames = (outer, inner) if is_outer else (inner, outer)
-    if len(cameras.elements) != CAMERA_COUNT or (
-        "frame" in cameras.owner and "cam" not in cameras.owner
-    ):
+    if "frame" in cameras.owner and "cam" not in cameras.owner:
         return
     frame = _numbers_at(frames, _FRAME_KEYS)
     yield PosesAt(
