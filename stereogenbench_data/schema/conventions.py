@@ -27,6 +27,7 @@ import json
 import re
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, get_args
@@ -363,27 +364,17 @@ def _is_text(value: object) -> bool:
     return isinstance(value, str) and 0 < len(value) <= _LONGEST
 
 
-def _is_place(*axes: int) -> Callable[[object], bool]:
+def _axes_of(value: object) -> int | None:
+    """Return how many axes a place in a document or below a row has; None of what is no place."""
+    if isinstance(value, str) and len(value) <= _LONGEST:
+        with suppress(LookupError):
+            return place_at(value).axes
+    return None
+
+
+def _is_place(*axes: int) -> Callable[[Any], bool]:
     """Return what tells whether a value is a place in a document, with such a number of axes."""
-
-    def is_place(value: object) -> bool:
-        if not (_is_text(value) and str(value)[0] == "$" < str(value)):
-            return False
-        try:
-            return place_at(str(value)).axes in axes
-        except LookupError:
-            return False
-
-    return is_place
-
-
-def _is_row_part(value: object) -> bool:
-    if not (isinstance(value, str) and len(value) <= _LONGEST):
-        return False
-    try:
-        return value == "order" or place_at(value).axes == 0
-    except LookupError:
-        return False
+    return lambda value: _is_text(value) and value[0] == "$" < value and _axes_of(value) in axes
 
 
 _PLACE: Final = "a JSON path, such as $.camera_intrinsics.focal_length_mm"
@@ -410,7 +401,8 @@ _RULES_OF: Final[Mapping[int, tuple[tuple[str, Callable[[Any], bool], str], ...]
          "$.frames[].cameras[].location[x,y,z]"),
         ("rows", _is_place(1, 2),
          "a JSON path that ends in [] or {}, such as $.pairwise_pairs[]"),
-        ("a b length", _is_row_part, 'a place below the row, such as "camera_index_a" or "#0"'),
+        ("a b length", lambda value: value == "order" or _axes_of(value) == 0,
+         'a place below the row, such as "camera_index_a" or "#0"'),
         ("place left right", _is_place(0), _PLACE),
     ),
 }  # fmt: skip
