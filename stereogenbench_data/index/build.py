@@ -592,9 +592,7 @@ def report_of(tree: Tree, of_keys: Mapping[str, Outcome]) -> TreeReport:
     Scenes without their completion mark are not finished, unless no scene of the tree has one.
     """
     outcomes = [of_keys[key] for key in tree.keys]
-    is_incomplete = [isinstance(out.found, IncompleteScene) for out in outcomes]
-    marked = (out.has_mark for out, lacks in zip(outcomes, is_incomplete, strict=True) if not lacks)
-    if tree.is_marked or any(marked):
+    if tree.is_marked:
         outcomes = [out if out.has_mark else Outcome(out.key, unfinished(out.key))
                     for out in outcomes]  # fmt: skip
     left_out = {out.key: out.found for out in outcomes if not isinstance(out.found, Scene)}
