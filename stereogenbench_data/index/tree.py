@@ -527,7 +527,7 @@ class RemoteTree:
         refused = {key: why for key in others if (why := refusal(self.root.where, key))}
         return {key: dict(sorted(files.items())) for key, files in found.items()}, refused
 
-    def _listed(self, folder: str) -> dict[str, tuple[int, int]]:
+    def _listed(self, folder: str) -> Mapping[str, Sequence[int]]:
         def listed() -> dict[str, tuple[int, int]]:
             return {
                 path: (size, _number(version))
@@ -535,10 +535,8 @@ class RemoteTree:
                 if size is not None
             }
 
-        return {
-            path: (size, number)
-            for path, (size, number) in self._cached_or_built(folder, listed).items()
-        }
+        found: Mapping[str, Sequence[int]] = self._cached_or_built(folder, listed)
+        return found
 
     def _cached_or_built(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return an answer as JSON holds it; that of a commit is kept."""
