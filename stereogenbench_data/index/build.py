@@ -324,7 +324,6 @@ class Tree:
 
     def outcome(self, folder: SceneFolder, advance: Advance = no_advance) -> Outcome:
         """Return what becomes of a scene whose files are all read, in a worker process too."""
-        advance(0)
         return replace(self.settling(folder, None), poses=None)
 
 

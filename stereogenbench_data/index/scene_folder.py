@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Final, Literal, TypeVar
+from typing import Final, Literal
 
 import numpy as np
 
@@ -93,8 +93,6 @@ from stereogenbench_data.schema.release import (
 )
 from stereogenbench_data.schema.text import counted, shortened
 from stereogenbench_data.schema.training import TrainingDocument, parse_training
-
-_T = TypeVar("_T")
 
 ValidDepth = Literal["skip", "sample"]
 
