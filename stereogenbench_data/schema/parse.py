@@ -122,11 +122,8 @@ def _plain_text(value: object) -> str | None:
     """Return a text that can be written as UTF-8, None for another value."""
     if not isinstance(value, str) or len(value) > MOST_LETTERS:
         return None
-    return (
-        None
-        if not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value)
-        else value
-    )
+    has_halves = not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value)
+    return None if has_halves else value
 
 
 def parse_complete(text: bytes, *, where: str) -> tuple[SceneLabels, tuple[Remark, ...]]:
