@@ -200,9 +200,6 @@ def _row(
     places_m = assumed_places_m(rig)
     if not places_m:
         return None
-    ends = ((each.lateral_m[end] for end in each.rig.primary_pair) for each in alike)
-    if all(left_m > right_m for left_m, right_m in ends):  # numbered from right to left
-        places_m = tuple(-place_m for place_m in places_m)
     lacking = [missing_video(key, name) for name in VIDEO_FILES
                if held_name(files, name) not in files]  # fmt: skip
     lacking += [why for name, why in hollow.items() if name != TRAJECTORY_JSON]
