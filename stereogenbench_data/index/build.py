@@ -269,9 +269,7 @@ class Tree:
     def kept(self, name: str) -> Scene | None:
         """Return the scene that the user's cache holds by its `name_of`; None if there is none."""
         text = self.cache.read("scenes", name)
-        with suppress(ValueError, KeyError, TypeError, IndexError, AttributeError):
-            return None if text is None else scene_of_json(json.loads(text))
-        return None
+        return None if text is None else scene_of_json(json.loads(text))
 
     def name_of(self, folder: SceneFolder, videos: Collection[str] | None = None) -> str:
         """Return what a scene that is described is kept under.
