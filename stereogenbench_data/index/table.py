@@ -1002,9 +1002,7 @@ _FAR_M: Final = 200.0
 """Scenes of stereo are nearer: 6 cm apart, cameras show half a pixel of that at 1,756 px."""
 
 
-_ASSUMED: Final = (
-    "size", "stated", "baselines", "pair", "lens", "marker", "world", "pixels",
-)  # fmt: skip
+_ASSUMED: Final = ("size", "baselines", "marker", "world", "pixels")
 """Remarks that are told when a tree is opened without conventions."""
 _OF_TIME: Final = ("frames", "rate")
 """Remarks that are told whenever a tree is opened."""
