@@ -99,7 +99,7 @@ def _question_answer(scenes: Sequence[SceneDiagnosis], question: Question) -> An
     decides = worst if not is_changed else states.get(declared, "untested")
     if is_changed and not of_declared.low_db > 0:
         decides = "close"
-    status = _STATUS[is_changed, decides]
+    status = _STATUS.get((is_changed, decides), "cannot tell")
     at_end = question == "frame_lag" and abs(best) == max(LAGS)
     want = "frames or of motion" if question == "frame_lag" else "depth where it would be"
     close = [answer for answer, state in states.items() if state == "close"]
@@ -129,15 +129,11 @@ _STATES: Final = get_args(State)
 _STATUS: Final[dict[tuple[bool, State], Status]] = {
     (False, "excluded"): "confirmed",
     (False, "behind"): "not contradicted",
-    (False, "close"): "cannot tell",
-    (False, "untested"): "cannot tell",
     (True, "excluded"): "wrong",
     (True, "behind"): "wrong",
-    (True, "close"): "cannot tell",
-    (True, "untested"): "cannot tell",
 }
 """By whether another answer than the declared one is best, and by how the declared one stands, or
-of the others the one that stands best."""
+of the others the one that stands best. Of any other state, pictures cannot tell."""
 
 
 def _state(scenes: Sequence[Gain]) -> State:
