@@ -87,12 +87,10 @@ NOTHING: Final = Gain(math.nan, math.inf)
 def weighted_mean(
     values: Sequence[float], errors: Sequence[float], *, least: float
 ) -> tuple[float, float]:
-    """Return the mean weighted by 1 / error^2, and its standard error; nan and inf for no values.
+    """Return the mean weighted by 1 / error^2, and its standard error, of one value or more.
 
     It is at least as certain as each of its parts. Smaller errors count as ``least``.
     """
-    if not len(values):
-        return math.nan, math.inf
     floored = np.maximum(errors, least)
     # Relative weights, so that errors that are all infinite still give the mean.
     precision = (
