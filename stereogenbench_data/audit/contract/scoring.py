@@ -64,11 +64,6 @@ class Gain:
         """The lower end of the 95 % interval."""
         return self.mean_db - NORMAL_975 * self.interval_error_db
 
-    @property
-    def is_excluded(self) -> bool:
-        """Whether the other contract is excluded: the whole interval is beyond the margin."""
-        return self.low_db >= self.least_db
-
     def is_clear(
         self, *, least_db: float | None = None, errors: float = limits.LEAST_ERRORS
     ) -> bool:

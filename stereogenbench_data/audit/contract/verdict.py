@@ -143,7 +143,8 @@ def _state(scenes: Sequence[Gain]) -> State:
         return "untested"
     if not is_ruled_out(tested):
         return "close"
-    return "excluded" if all(gain.is_excluded for gain in tested) else "behind"
+    # The whole interval must be beyond the margin.
+    return "excluded" if all(gain.low_db >= gain.least_db for gain in tested) else "behind"
 
 
 def _lag_states(states: Mapping[int, State], *, declared: int, best: int) -> dict[int, State]:
