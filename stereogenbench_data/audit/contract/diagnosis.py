@@ -25,7 +25,6 @@ from stereogenbench_data.audit.contract.scoring import (
     NOTHING,
     SURE,
     Gain,
-    RayPower,
     ScoredContract,
     Scorer,
 )
@@ -131,7 +130,8 @@ class ContractSearch:
         self._scorer = Scorer(views, self._matches)
         self.fitted = cache(self._scorer.fitted)
         self._promising = cache(self._find_promising)
-        self._power = cache(self._find_power)
+        # The power of the ray's length, for a hypothesis of any kind and scale.
+        self._power = cache(lambda planar: self._scorer.ray_power(self.fitted(planar)))
         self._moved_px = cache(self._find_moved_px)
         self.declared = Hypothesis.declared(views.encoding)
 
@@ -271,10 +271,6 @@ class ContractSearch:
             if here is not None and there is not None and (known := here[1] & there[1]).any():
                 moved_px.append(float(np.abs(here[0] - there[0])[known].mean()))
         return float(np.median(moved_px)) if moved_px else 0.0
-
-    def _find_power(self, planar: Hypothesis) -> RayPower:
-        """Return the power of the ray's length for a hypothesis of any kind and scale."""
-        return self._scorer.ray_power(self.fitted(planar))
 
 
 def _checked(
