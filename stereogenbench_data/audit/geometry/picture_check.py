@@ -100,7 +100,7 @@ def stored_figures(member: str, seen: Bool[np.ndarray, " 65536"]) -> Iterator[Fi
 
 
 def stored_step(numbers: np.ndarray) -> float:
-    """Return the step between ascending stored numbers, nan for fewer than two.
+    """Return the step between two or more ascending stored numbers.
 
     It is the greatest common divisor of their distances. If that is 1 and the numbers are many, it
     is the least distance: numbers of 10 or 12 bits that were stretched to 16 are not evenly spaced.
@@ -109,8 +109,6 @@ def stored_step(numbers: np.ndarray) -> float:
     (100.0, 1.0)
     """
     gaps = np.diff(numbers)
-    if not len(gaps):
-        return math.nan
     step = int(np.gcd.reduce(gaps))
     stretched = step == 1 and len(numbers) >= ENOUGH_LEVELS
     return float(gaps.min() if stretched else step)
@@ -141,13 +139,11 @@ def border_occluder(depth_m: Map, measured: Mask, *, far_m: float) -> tuple[floa
     Args:
         depth_m: Depth in metres.
         measured: Where it was measured.
-        far_m: The distance of the subject, see `subject_m`.
+        far_m: The distance of the subject, see `subject_m`; by nan nothing is near.
 
     Returns:
         The share, and "left", "right", "top", "bottom", or "" if it is 0.
     """
-    if math.isnan(far_m):
-        return 0.0, ""
     near = measured & (depth_m < NEAR_SHARE * far_m)
     if near.mean() <= _COVERED:
         near &= ~near.all(axis=1, keepdims=True)
