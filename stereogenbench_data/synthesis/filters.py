@@ -123,11 +123,9 @@ def find_spawn(proposal: Proposal, *, world: World) -> Spawn | Refusal:
         fall = _cast_one(world, (x, y, z), (0.0, 0.0, -1.0))
         if not np.isfinite(fall):
             break
-        if fall == 0:
-            z -= _STEP_DOWN_M
-            continue
         z -= fall
-        if z >= low[2] - LIMITS.support_gap_m:
+        # From inside a solid it falls by 0.
+        if fall > 0 and z >= low[2] - LIMITS.support_gap_m:
             floors.append(z)
         z -= _STEP_DOWN_M
     if not floors:
