@@ -128,9 +128,9 @@ def plan_scenes(
     with _disk_errors(tree.out):
         there = tree.existing(indices)
         do_items(
-            _plan,
-            [(tree, index) for index in indices if index not in there],
-            name=lambda task: f"scene {task[1]} of {request.stream}",
+            tree.plan,
+            [index for index in indices if index not in there],
+            name=lambda index: f"scene {index} of {request.stream}",
             keep=found.append,
             options={"workers": 1, **options},
             done=len(there),
@@ -222,6 +222,12 @@ class _Tree:
             finally:
                 shutil.rmtree(unfinished, ignore_errors=True)
 
+    def plan(self, index: int, after_scene: Advance) -> Planned:
+        """Search for a scene's plan; a worker process calls this."""
+        planned = plan_scene(self.request, index=index, renderer=self.renderer)
+        after_scene(1)
+        return planned
+
     def draw(self, unfinished: Path, index: int, after_frames: Advance) -> None:
         """Render proposals of a scene until one passes its checks, and move it to its place.
 
@@ -285,14 +291,6 @@ class _Tree:
             self._require_own(target, plan.proposal.index)
         else:
             folder.rename(target)
-
-
-def _plan(task: tuple[_Tree, int], after_scene: Advance) -> Planned:
-    """Search for a scene's plan; a worker process calls this."""
-    tree, index = task
-    planned = plan_scene(tree.request, index=index, renderer=tree.renderer)
-    after_scene(1)
-    return planned
 
 
 def _of_part(request: SynthRequest, part: tuple[int, int]) -> list[int]:
