@@ -367,26 +367,15 @@ def one_thread(*libraries: ModuleType) -> Iterator[None]:
             change(threads)
 
 
-@dataclass(slots=True)
 class PairScorer:
-    """Gathers the scores of one source's right views of one pair.
+    """Gathers the scores of one source's right views of one pair."""
 
-    Attributes:
-        protocol: Which metrics are computed, and how.
-        read: Reads the source's right views of the scene.
-        wanted: The pair.
-    """
-
-    protocol: EvaluationProtocol
-    read: Read
-    wanted: PairFrames
-    _scores: PairScores = field(default_factory=PairScores)
-    _clip: list[tuple[Any, Any]] = field(default_factory=list)
-    _read_pixels: Any = field(default_factory=hashlib.sha256)
-
-    def __post_init__(self) -> None:
-        """Begin with no frame."""
-        self._scores.columns = {name: [] for name in self.protocol.columns}
+    def __init__(self, protocol: EvaluationProtocol, read: Read, wanted: PairFrames) -> None:
+        """Begin with no frame; ``read`` reads the right views of the pair that is wanted."""
+        self.protocol, self.read, self.wanted = protocol, read, wanted
+        self._scores = PairScores({name: [] for name in protocol.columns})
+        self._clip: list[tuple[Any, Any]] = []
+        self._read_pixels = hashlib.sha256()
 
     def add(self, frames: Sequence[TargetFrame]) -> None:
         """Read the right views of some frames, in order, and score them.
