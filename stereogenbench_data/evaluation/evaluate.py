@@ -445,8 +445,7 @@ def _scores(
     gathered: dict[tuple[Labels, str], tuple[FeatureStatistics, FeatureStatistics]] = {}
     for pair_means, scores in pair_scores(run, out, name):
         means.append(pair_means)
-        columns = (run.index.column(each)[pair_means.row] for each in ("subset", "family"))
-        subset, family = columns
+        subset, family = (run.index.column(each)[pair_means.row] for each in ("subset", "family"))
         branch: Labels = (subset or "", family)
         for metric in scores.predicted if pair_means.is_primary else ():
             sides = scores.predicted[metric], scores.target[metric]
