@@ -168,7 +168,6 @@ class Catalogue:
             SelectionError: If there is no such scene, naming those that are close.
         """
         row = self.row(key)
-        key = str(self.index.column("key")[row])
         scene, pairs = self.index.scene(row), self.choose(choice).pairs
         mine = pairs.row == row
         selected = set(
