@@ -89,8 +89,7 @@ class _Search:
     """The search for the path of one proposal."""
 
     def __init__(self, proposal: Proposal, *, world: World, body_m: Array) -> None:
-        self.proposal, self.world, self.body_m = proposal, world, body_m
-        self.rig = proposal.rig
+        self.rig, self.world, self.body_m = proposal.rig, world, body_m
         self.rng = proposal.rng("path")
         self.frames = len(body_m)
         middle = (body_m.min(axis=1) + body_m.max(axis=1)) / 2
