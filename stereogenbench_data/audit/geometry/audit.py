@@ -137,9 +137,8 @@ def audit(
     names = {scene.id.key: _stamp(index, scene) for scene in scenes}
     found: dict[str, SceneAudit] = {}
     for key, name in names.items():
-        with suppress(KeyError, TypeError, ValueError):  # it is damaged
-            known = cache.read(kind, name)
-            found |= {} if known is None else {key: SceneAudit.revived(json.loads(known))}
+        with suppress(KeyError, TypeError, ValueError):  # there is none, or it is damaged
+            found[key] = SceneAudit.revived(json.loads(cache.read(kind, name) or b""))
     tasks = [
         AuditTask(scene, source_of(index, scene), frames)
         for scene in scenes
