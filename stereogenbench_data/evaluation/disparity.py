@@ -111,8 +111,7 @@ def evaluate_disparity(
     fields = (*_TRUTH, *source.inputs)
     index, scenes = select_pairs(data, fields, protocol, options=options, conventions=conventions)
     settings = _settings_of(protocol)
-    known = {"settings": settings}
-    run = Run(index, scenes, protocol, (source,), DISPARITY, settings=known)
+    run = Run(index, scenes, protocol, (source,), DISPARITY, settings={"settings": settings})
     with scored_scenes(run, score_disparity, options) as out:
         pairs = tuple(means for means, _ in pair_scores(run, out, source.name))
     return Scores(source.name, run.tier, protocol, settings, index, pairs)
