@@ -8,7 +8,7 @@ conditions.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Literal
+from typing import ClassVar, Final, Literal
 
 from stereogenbench_data.errors import EvaluationError
 from stereogenbench_data.evaluation.columns import (
@@ -85,6 +85,8 @@ class DisparityProtocol:
     max_disparity_px: float | None = None
     depth: DepthEncoding | None = None
     batch_frames: int = 8
+    plotted: ClassVar[tuple[str, ...]] = ("epe", "bad_2", "d1")
+    """The columns that are drawn against the baseline."""
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -96,11 +98,6 @@ class DisparityProtocol:
             )
         if self.batch_frames < 1:
             raise EvaluationError(f"batch_frames must be at least 1, got {self.batch_frames}.")
-
-    @property
-    def plotted(self) -> tuple[str, ...]:
-        """The columns that are drawn against the baseline."""
-        return ("epe", "bad_2", "d1")
 
     def label(self, column: str) -> str:
         """Return what tables call a column."""
