@@ -114,6 +114,7 @@ class Catalogue:
     def summary(self, choice: Choice) -> dict[str, Any]:
         """Return how many scenes and pairs a choice leaves, why none, and the filters' counts.
 
+        The line is Python that selects the chosen pairs with all frames; it runs as it is.
         A filter's value counts the scenes that all other filters leave; a baseline bin counts
         pairs.
         """
@@ -122,7 +123,7 @@ class Catalogue:
             "scenes": len(chosen.rows),
             "pairs": len(chosen.pairs),
             "reason": chosen.reason,
-            "line": self.selection_line(choice),
+            "line": self._line("pairs", {"pairs": "all", **choice, "frames": "all"}),
             "counts": {name: self._counts(choice, name) for name in FACETS}
             | {"bin": self._bin_counts(choice)},
         }
@@ -188,10 +189,6 @@ class Catalogue:
                 )
             ],
         }
-
-    def selection_line(self, choice: Choice) -> str:
-        """Return Python that selects the chosen pairs with all frames; it runs as it is."""
-        return self._line("pairs", {"pairs": "all", **choice, "frames": "all"})
 
     def sample_line(self, key: str, *, pair: tuple[int, int], frame: int) -> str:
         """Return Python that gives the sample shown; it runs as it is."""
