@@ -146,12 +146,6 @@ def _read_pfm(path: Path, size: tuple[int, int]) -> np.ndarray:
     return np.frombuffer(content, dtype=f"{order}f4").reshape(size)[::-1]
 
 
-def _read_npy(path: Path, size: tuple[int, int]) -> np.ndarray:
-    # Mapped, so that an array of another size is not read.
-    mapped: np.ndarray = np.load(path, mmap_mode="r", allow_pickle=False)
-    return mapped
-
-
 def _read_npz(path: Path, size: tuple[int, int]) -> np.ndarray:
     with zipfile.ZipFile(path) as archive:
         names = archive.namelist()
@@ -169,6 +163,7 @@ def _read_npz(path: Path, size: tuple[int, int]) -> np.ndarray:
 _READERS: Final[Mapping[str, Callable[[Path, tuple[int, int]], np.ndarray]]] = {
     ".png": _read_png,
     ".pfm": _read_pfm,
-    ".npy": _read_npy,
+    # Mapped, so that an array of another size is not read.
+    ".npy": lambda path, size: np.load(path, mmap_mode="r", allow_pickle=False),
     ".npz": _read_npz,
 }
