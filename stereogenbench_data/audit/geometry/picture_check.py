@@ -27,8 +27,7 @@ Units = UInt16[np.ndarray, "h w"]
 
 def luma_of(picture: UInt8[np.ndarray, "3 h w"]) -> Luma:
     """Return the luma of a picture, from 0 to 255."""
-    luma: Luma = np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
-    return luma
+    return np.tensordot(_LUMA, picture.astype(np.float32), axes=1)
 
 
 def band_passed(luma: Luma) -> Luma:
@@ -45,8 +44,7 @@ def band_passed(luma: Luma) -> Luma:
         fours = twos[:-2] + twos[2:]
         eights = fours[:-4] + fours[4:]
         mean = np.ascontiguousarray((eights[:size] + fours[8 : 8 + size] + ones[12:]).T)
-    band: Luma = blurred / np.float32(16**2) - mean / np.float32(13**2)
-    return band
+    return blurred / np.float32(16**2) - mean / np.float32(13**2)
 
 
 def reduced_size(height_px: int, width_px: int) -> tuple[int, int]:

@@ -106,8 +106,7 @@ def mutual_matches(left: Keypoints, right: Keypoints) -> Int64[np.ndarray, "m 2"
     backward, clear_back = _nearest(squared.T.contiguous())
     here = torch.arange(len(one))
     mutual = clear & clear_back[forward] & (backward[forward] == here)
-    pairs: Int64[np.ndarray, "m 2"] = torch.stack([here, forward], dim=1)[mutual].numpy()
-    return pairs
+    return torch.stack([here, forward], dim=1)[mutual].numpy()
 
 
 def _nearest(squared: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -163,8 +163,7 @@ def _near_the_median_line(
     slope, offset = _median_line(estimated[some], true[some])
     apart = np.abs(true - slope * estimated - offset)
     sigma = _MAD_TO_SIGMA * float(np.median(apart[some]))
-    near: Bool[np.ndarray, " n"] = apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
-    return near
+    return apart <= max(_OUTLIER_SIGMAS * sigma, _OUTLIER_PX)
 
 
 def _least_squares(

@@ -386,8 +386,7 @@ class Subject:
         self.place(None, time_frames=time_frames)
         points = self._vertices()[self.chosen] + times * self.travel - self.soles
         turn = np.array(Matrix.Rotation(math.radians(90.0 + self.facing), 3, "Z"))
-        placed: Array = points @ turn.T * (self.scale * self.unit_m) * _FLIP
-        return placed
+        return points @ turn.T * (self.scale * self.unit_m) * _FLIP
 
     def _vertices(self) -> Array:
         """Return all vertices of the posed meshes, in file units."""
@@ -406,8 +405,7 @@ class Subject:
         shown = self.armature.evaluated_get(bpy.context.evaluated_depsgraph_get())
         matrix = np.array(shown.matrix_world)
         ends = np.array([end for bone in shown.pose.bones for end in (bone.head, bone.tail)])
-        placed: Array = ends @ matrix[:3, :3].T + matrix[:3, 3]
-        return placed
+        return ends @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _armature_of(objects: list[Any], *, where: str) -> Any:
@@ -663,8 +661,7 @@ class Stage:
         self._set_cameras(shot, eyes=eyes, axes=turned)
         bpy.ops.render.render(write_still=True)
         depths = self._depths(width_px, height_px)
-        depths_m: Array = np.where(depths < _NOTHING, depths * self.unit_m, np.inf)
-        return depths_m
+        return np.where(depths < _NOTHING, depths * self.unit_m, np.inf)
 
     def _depths(self, width_px: int, height_px: int) -> Array:
         """Return Cycles' depth along the axis (cameras, h, w), of the frame that is set."""
