@@ -65,9 +65,7 @@ def _range(query: Mapping[str, list[str]], name: str) -> tuple[float, ...] | Non
     """Return the closed range of two numbers; an end that is left out is open."""
     ends = [query.get(f"{name}_{end}", [""])[0].strip() for end in ("low", "high")]
     try:
-        numbers = [
-            float(text or open_end) for text, open_end in zip(ends, ("0", "1e6"), strict=True)
-        ]
+        numbers = float(ends[0] or 0), float(ends[1] or 1e6)
         whole = tuple(int(each) if each == round(each) else each for each in numbers)
     except (ValueError, OverflowError):
         raise SelectionError(f"{name} must be of numbers, got {shortened(str(ends))}.") from None
