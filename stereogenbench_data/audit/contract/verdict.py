@@ -273,7 +273,7 @@ def _beside_default(scenes: Sequence[SceneDiagnosis]) -> Iterator[Answer]:
     elif scenes[0].best != scenes[0].declared:
         yield replace(blank, note="not answered while another answer is wrong")
     elif gain.is_clear():
-        yield replace(blank, found=f"{declared}, not {default}", status="confirmed")
+        yield replace(blank, found=f"it is {declared}, not {default}", status="confirmed")
     elif against.low_db > 0 and all(scene.default_fits for scene in scenes):
         yield replace(blank, found=default, status="wrong")
     else:
