@@ -5,6 +5,7 @@
     $["the map"].name                       a key that is no plain word
     $.frames[].cameras[]                    all elements of lists: an axis each
     $.frames{}, $.frames[].{Cam_}           all entries whose keys end in a number (after "Cam_")
+    $.frames{*}, $.frames[].{Cam_*}         all entries (whose keys begin with "Cam_")
     $.frames[].cameras[].location[x,y,z]    several values below, side by side
     $.cameras[].pose[0:3]                   a part of a list
     $.pose~                                 the numbers of a text
@@ -42,7 +43,11 @@ _LONGEST_TEXT: Final = 4096
 
 @dataclass(frozen=True, slots=True)
 class Entries:
-    """A step to all entries of an object whose keys end in a number, after some text or any."""
+    """A step to entries of an object.
+
+    They are those whose keys end in a number, after some text or any; or, where the text ends in
+    "*", those whose keys begin with it.
+    """
 
     text: str
 
@@ -251,7 +256,9 @@ def _children(node: Any, step: Step, text: str) -> list[tuple[str | int, Any]]:
 
 
 def is_entry(key: str, step: Entries) -> bool:
-    """Return whether a key ends in a number after a step's text."""
+    """Return whether a key is of an entry to which a step leads."""
+    if step.text.endswith("*"):
+        return key.startswith(step.text[:-1])
     match = _ENDS_IN_DIGITS.match(key[-_LONGEST_TEXT:])
     return match is not None and match[1].endswith(step.text)
 

@@ -240,6 +240,14 @@ DECLARED = {
         {"frame": "${frame_}#", "camera": "${frame_}.{view }#", "first": 1, "step": 2},
         "${frame_}.{view }.t~",
     ),
+    "keys that end in no number": (
+        lambda document: {"frames": {f"frame_{number:04d}@{number / 15:.3f}s": {
+            "abcdef"[camera] + "_rgb": {"camera": camera, "t": place}
+            for camera, place in [*enumerate(poses)][::-1]
+        } for number, poses in enumerate(places(document).tolist())}},
+        {"frame": "$.frames{frame_*}#0", "camera": "$.frames{*}{*}.camera"},
+        "$.frames{frame_*}{*}.t",
+    ),
     "a part of a list, in rows": (
         lambda document: {"rows": [
             {"n": number, "c": camera, "pose": [*place, 9.0]}
