@@ -214,11 +214,8 @@ def _fitting(found: Iterable[Reading], rig: Rig, *, where: str) -> MatchedPoses:
         raise told
     if first is None or not passed:
         tried = "; ".join(f"{reason} ({name})" for reason, name in list(failures.items())[:_SHOWN])
-        why = (
-            f"{tried}. It may be another scene's, or in another unit"
-            if tried
-            else ("it has no location with a rotation")
-        )
+        misfit = f"{tried}. It may be another scene's, or in another unit"
+        why = misfit if tried else "it has no location with a rotation"
         raise SchemaError(f"{where}: no reading of its poses fits the rig of baseline.json: {why}.")
     taken = passed[0]
     others = [each for each in passed[1:] if not _same(each.poses, taken.poses, _rig_at)]

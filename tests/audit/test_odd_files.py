@@ -204,3 +204,16 @@ def test_the_last_line_says_what_is_settled_and_the_next_command(
     assert last_cured == (
         f"{file}: fits. Next: stereogenbench show {root} --conventions {file} -o first.png"
     )
+
+
+def test_a_principal_point_that_stops_intrinsics_is_not_settled(make_scene, root, rewrite):
+    rewrite(
+        make_scene() / "baseline.json",
+        lambda document: document["camera_intrinsics"].update(cx=300.5),
+    )
+
+    told = invoke("conventions", root, "--pictures", "0", "--workers", "1")
+
+    assert told.exit_code == 1
+    assert re.search(r"NOT SETTLED: .*principal point \(300\.5, 0\)", told.stderr)
+    assert "not settled: baseline.json. Next: " in told.stderr

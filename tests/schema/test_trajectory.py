@@ -314,3 +314,12 @@ def test_every_number_of_a_pose_is_read_exactly(numbers):
     expected = np.array(numbers).reshape(1, 6, 6)
     np.testing.assert_array_equal(block(document, "location").values, expected[..., :3])
     np.testing.assert_array_equal(block(document, "rotation").values, expected[..., 3:])
+
+
+def test_a_place_of_numbers_in_a_text_that_leads_to_no_text_says_what_stands_there(
+    trajectory_document,
+):
+    with pytest.raises(SchemaError, match=r"frame 0, camera 0: .* found an object with 3 keys"):
+        read_block(
+            trajectory_document, RELEASED, "$.frames[].cameras[].location~", where="trajectory.json"
+        )
